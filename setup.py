@@ -1,0 +1,22 @@
+"""`pip install -e .`: the core without ROS, and the command line. colcon reads package.xml."""
+
+from pathlib import Path
+
+from setuptools import setup
+
+ROOT = Path(__file__).parent
+REQUIREMENTS = (ROOT / 'requirements.txt').read_text().splitlines()
+
+setup(
+    name='cutting_trainer',
+    version='0.1.0',
+    description='Teleoperated soft-tissue cutting trainer for ROS 2',
+    license='Apache-2.0',
+    python_requires='>=3.11,<3.14',
+    packages=['tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session'],
+    # Lower bounds: the launcher pins exactly, a library must not.
+    install_requires=[
+        line.replace('==', '>=') for line in REQUIREMENTS if line and not line.startswith('#')
+    ],
+    entry_points={'console_scripts': ['cutting-trainer = session.cli:main']},
+)
