@@ -1,0 +1,148 @@
+"""Which tetrahedron holds a point of the deformed tissue."""
+
+import numpy as np
+from numba import njit
+
+_INSIDE = -1e-9
+
+
+@njit(cache=True)
+def barycentric(positions, tetrahedra, tet, point, out):
+    """Barycentric coordinates of a point in a tetrahedron.
+
+    Args:
+        positions: node positions [m], shape (n, 3).
+        tetrahedra: shape (m, 4).
+        tet: which one.
+        point: [m], shape (3,).
+        out: output, sum 1, shape (4,).
+
+    Returns:
+        The smallest of them, or -inf for a flat tetrahedron.
+    """
+    o = positions[tetrahedra[tet, 0]]
+    a = positions[tetrahedra[tet, 1]]
+    b = positions[tetrahedra[tet, 2]]
+    c = positions[tetrahedra[tet, 3]]
+    ax, ay, az = a[0] - o[0], a[1] - o[1], a[2] - o[2]
+    bx, by, bz = b[0] - o[0], b[1] - o[1], b[2] - o[2]
+    cx, cy, cz = c[0] - o[0], c[1] - o[1], c[2] - o[2]
+    px, py, pz = point[0] - o[0], point[1] - o[1], point[2] - o[2]
+    nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    determinant = ax * nx + ay * ny + az * nz
+    if determinant == 0.0:
+        return -np.inf
+    out[1] = (px * nx + py * ny + pz * nz) / determinant
+    nx, ny, nz = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+    out[2] = (px * nx + py * ny + pz * nz) / determinant
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    out[3] = (px * nx + py * ny + pz * nz) / determinant
+    out[0] = 1.0 - out[1] - out[2] - out[3]
+    return min(min(out[0], out[1]), min(out[2], out[3]))
+
+
+@njit(cache=True)
+def _walk(positions, tetrahedra, neighbors, point, start, out):
+    """Walks from `start` through the face the point lies farthest beyond; -1: it left the body."""
+    tet = start
+    for _ in range(200):
+        if barycentric(positions, tetrahedra, tet, point, out) >= _INSIDE:
+            return tet
+        face = neighbors[tet, np.argmin(out)]
+        if face < 0:
+            return -1
+        tet = face // 4
+    return -1
+
+
+@njit(cache=True)
+def _search(positions, tetrahedra, point, out):
+    """Looks at every tetrahedron whose box holds the point."""
+    for tet in range(len(tetrahedra)):
+        inside = True
+        for i in range(3):
+            a = positions[tetrahedra[tet, 0], i]
+            b = positions[tetrahedra[tet, 1], i]
+            c = positions[tetrahedra[tet, 2], i]
+            d = positions[tetrahedra[tet, 3], i]
+            low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+            if point[i] < low or point[i] > high:
+                inside = False
+                break
+        if inside and barycentric(positions, tetrahedra, tet, point, out) >= _INSIDE:
+            return tet
+    return -1
+
+
+@njit(cache=True)
+def locate_points(positions, tetrahedra, neighbors, points, hint, found, weights):
+    """Finds the tetrahedra that hold some points: a walk from the last one, else a search.
+
+    A walk fails where the body is not convex, across an open cut above all.
+
+    Args:
+        positions: node positions [m], shape (n, 3).
+        tetrahedra: shape (m, 4).
+        neighbors: faces across, as `TetMesh.neighbors`, shape (m, 4).
+        points: [m], shape (p, 3).
+        hint: tetrahedron to begin with.
+        found: output, the tetrahedron of each point or -1, shape (p,).
+        weights: output, barycentric coordinates, shape (p, 4).
+    """
+    tet = min(max(hint, 0), len(tetrahedra) - 1)
+    for k in range(len(points)):
+        at = _walk(positions, tetrahedra, neighbors, points[k], tet, weights[k])
+        if at < 0:
+            at = _search(positions, tetrahedra, points[k], weights[k])
+        found[k] = at
+        if at >= 0:
+            tet = at
+
+
+@njit(cache=True)
+def distance_to_triangles(point, positions, triangles):
+    """Distance of a point to the nearest of some triangles [m].
+
+    Args:
+        point: [m], shape (3,).
+        positions: nodes [m], shape (n, 3).
+        triangles: nodes of each, shape (k, 3).
+    """
+    best = np.inf
+    for k in range(len(triangles)):
+        a, b, c = positions[triangles[k, 0]], positions[triangles[k, 1]], positions[triangles[k, 2]]
+        best = min(best, _squared_distance(point, a, b, c))
+    return np.sqrt(best)
+
+
+@njit(cache=True)
+def _squared_distance(p, a, b, c):
+    """To a triangle, by the Voronoi region of plane, edges and corners (Ericson 2005, 5.1.5)."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = _dot(ab, ap), _dot(ac, ap)
+    bp = p - b
+    d3, d4 = _dot(ab, bp), _dot(ac, bp)
+    cp = p - c
+    d5, d6 = _dot(ab, cp), _dot(ac, cp)
+    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
+    if d1 <= 0.0 and d2 <= 0.0:
+        nearest = a
+    elif d3 >= 0.0 and d4 <= d3:
+        nearest = b
+    elif d6 >= 0.0 and d5 <= d6:
+        nearest = c
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        nearest = a + ab * (d1 / (d1 - d3))
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        nearest = a + ac * (d2 / (d2 - d6))
+    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        nearest = b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
+    else:
+        nearest = a + ab * (vb / (va + vb + vc)) + ac * (vc / (va + vb + vc))
+    away = p - nearest
+    return _dot(away, away)
+
+
+@njit(cache=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

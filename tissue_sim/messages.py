@@ -1,0 +1,227 @@
+"""Between the core and `cutting_trainer_msgs`; arrays travel as they lie in memory."""
+
+import array
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from cutting_trainer_msgs.msg import Contact, ForceSample, Mesh, MeshDelta
+from cutting_trainer_msgs.srv import Cut
+
+from tissue_sim.mesh import TetMesh, TopologyDelta, Touched
+from tissue_sim.replica import state_hash
+from tissue_sim.ros import FRAME
+from tissue_sim.simulation import Frame, State, ToolContact
+
+_CODES = {'d': np.float64, 'I': np.uint32, 'B': np.uint8}
+
+
+def packed(code: str, values: np.ndarray) -> 'array.array[Any]':
+    """Values as the array type that messages hold: d, I or B."""
+    out: array.array[Any] = array.array(code)
+    out.frombytes(np.ascontiguousarray(values, _CODES[code]).tobytes())
+    return out
+
+
+def stamp(nanoseconds: int) -> Time:
+    """A time stamp [ns] as a message."""
+    return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
+
+
+def mesh_message(
+    mesh: TetMesh, displacement: np.ndarray, scene: str, revision: int, step: int, time_ns: int
+) -> Mesh:
+    """The whole tissue as a message."""
+    message = Mesh(scene=scene, revision=revision, topology=mesh.topology, step=step)
+    message.header.frame_id = FRAME
+    message.header.stamp = stamp(time_ns)
+    message.rest = packed('d', mesh.rest)
+    message.displacement = packed('d', displacement)
+    message.fixed = packed('B', mesh.fixed)
+    message.tetrahedra = packed('I', mesh.tetrahedra)
+    message.triangles = packed('I', mesh.triangles)
+    message.triangle_kind = packed('B', mesh.triangle_kind)
+    message.state_hash = state_hash(mesh.rest, displacement, mesh.tetrahedra)
+    return message
+
+
+class DeltaEncoder:
+    """Makes the deltas from one published state to the next.
+
+    Args:
+        mesh: the tissue.
+        displacement: [m], shape (n, 3), as in the full mesh that was published before.
+    """
+
+    def __init__(self, mesh: TetMesh, displacement: np.ndarray) -> None:
+        self._mesh = mesh
+        self._sent = displacement.copy()
+        self.revision = 0
+
+    def encode(
+        self,
+        displacement: np.ndarray,
+        step: int,
+        time_ns: int,
+        touched: Touched | None,
+        cut_step: int,
+    ) -> MeshDelta | None:
+        """The delta to the present state, or None when nothing differs.
+
+        Args:
+            displacement: present [m], shape (n, 3).
+            step: simulation frame.
+            time_ns: stamp [ns].
+            touched: what the last change of connectivity wrote, if it came since the last delta.
+            cut_step: frame whose shape that change was computed on.
+        """
+        n = self._mesh.node_count
+        if touched is None:
+            displaced = np.flatnonzero((displacement != self._sent).any(axis=1))
+            if len(displaced) == 0:
+                return None
+        else:
+            displaced = np.arange(n)
+        message = MeshDelta(base_revision=self.revision, step=step, topology=self._mesh.topology)
+        self.revision += 1
+        message.revision = self.revision
+        message.header.frame_id = FRAME
+        message.header.stamp = stamp(time_ns)
+        message.node_count = n
+        message.tetrahedron_count = len(self._mesh.tetrahedra)
+        message.triangle_count = len(self._mesh.triangles)
+        if len(displaced) < n:
+            message.displaced = packed('I', displaced)
+        message.displacement = packed('d', displacement[displaced])
+        if touched is not None:
+            self._connectivity(message, touched)
+            message.cut_step = cut_step
+            message.state_hash = state_hash(self._mesh.rest, displacement, self._mesh.tetrahedra)
+        self._sent = displacement.copy()
+        return message
+
+    def _connectivity(self, message: MeshDelta, touched: Touched) -> None:
+        mesh = self._mesh
+        message.rest_changed = packed('I', touched.rest)
+        message.rest = packed('d', mesh.rest[touched.rest])
+        message.fixed = packed('B', mesh.fixed[touched.rest])
+        message.tetrahedra_changed = packed('I', touched.tetrahedra)
+        message.tetrahedra = packed('I', mesh.tetrahedra[touched.tetrahedra])
+        message.triangles_changed = packed('I', touched.triangles)
+        message.triangles = packed('I', mesh.triangles[touched.triangles])
+        message.triangle_kind = packed('B', mesh.triangle_kind[touched.triangles])
+
+
+def force_message(
+    frame: Frame, revision: int, topology: int, contact: Contact | None, time_ns: int
+) -> ForceSample:
+    """One frame's reaction as a message."""
+    message = ForceSample(step=frame.step, revision=revision, topology=topology)
+    message.header.frame_id = FRAME
+    message.header.stamp = stamp(time_ns)
+    if contact is not None:
+        message.contact_sequence = contact.sequence
+        message.contact_stamp = contact.header.stamp
+    message.state = int(frame.state)
+    message.position = frame.position
+    message.force = frame.force
+    message.stiffness = frame.stiffness.ravel()
+    message.resistance = frame.resistance
+    message.kinetic_energy = frame.kinetic_energy
+    message.elastic_energy = frame.elastic_energy
+    return message
+
+
+def tool_contact(message: Contact, node_count: int) -> ToolContact:
+    """A contact for the core.
+
+    Args:
+        message: as received, from anybody.
+        node_count: of the mesh.
+
+    Raises:
+        ValueError: one sentence that says which field is wrong.
+    """
+    if message.state > Contact.INSIDE:
+        raise ValueError(f'state {message.state} is none of 0, 1, 2')
+    for name in ('weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip'):
+        values = getattr(message, name)
+        if not np.isfinite(values).all() or np.abs(values).max() > 10:
+            raise ValueError(f'{name} {values.tolist()} is not finite or beyond 10')
+    if not 0 <= message.coupling_stiffness <= 1e5:
+        raise ValueError(f'coupling_stiffness {message.coupling_stiffness} is not in 0 to 1e5 N/m')
+    if not 0 <= message.proxy_radius <= 0.1:
+        raise ValueError(f'proxy_radius {message.proxy_radius} is not in 0 to 0.1 m')
+    if message.state == Contact.TOUCHING:
+        if message.nodes.max() >= node_count:
+            raise ValueError(f'nodes {message.nodes.tolist()} go beyond the {node_count} nodes')
+        if abs(message.weights.sum() - 1) > 1e-6 or message.weights.min() < -1e-6:
+            raise ValueError(f'weights {message.weights.tolist()} are not barycentric')
+        if abs(np.linalg.norm(message.normal) - 1) > 1e-6:
+            raise ValueError(f'normal {message.normal.tolist()} is not a unit vector')
+    # A node of two touched triangles stands there twice.
+    nodes, slots = np.unique(message.nodes.astype(np.int64), return_inverse=True)
+    weights = np.bincount(slots, message.weights, len(nodes))
+    return ToolContact(
+        state=State(message.state),
+        topology=message.topology,
+        nodes=nodes[weights > 0],
+        weights=weights[weights > 0],
+        device=message.device,
+        offset=message.proxy - message.point,
+        normal=message.normal,
+        stiffness=message.coupling_stiffness,
+        radius=message.proxy_radius,
+        blade_root=message.blade_root,
+        blade_tip=message.blade_tip,
+        sequence=message.sequence,
+    )
+
+
+def delta_into(message: Any, delta: TopologyDelta) -> None:
+    """Writes a change of connectivity into a `Cut` response."""
+    message.node_parents = packed('I', delta.node_parents)
+    message.node_weights = packed('d', delta.node_weights)
+    message.moved_nodes = packed('I', delta.moved_nodes)
+    message.moved_parents = packed('I', delta.moved_parents)
+    message.moved_weights = packed('d', delta.moved_weights)
+    message.removed_tetrahedra = packed('I', delta.removed_tetrahedra)
+    message.tetrahedra = packed('I', delta.tetrahedra)
+    message.outer_faces = packed('B', delta.outer_faces)
+
+
+def delta_from(message: Cut.Response) -> TopologyDelta:
+    """Reads a change of connectivity from a `Cut` response.
+
+    Raises:
+        ValueError: its arrays do not fit each other.
+    """
+
+    def array_of(name: str, dtype: type, width: int) -> np.ndarray:
+        flat: np.ndarray = np.array(getattr(message, name), dtype)
+        if len(flat) % width:
+            raise ValueError(f'{name} has {len(flat)} values, not a multiple of {width}')
+        return flat.reshape(-1, width) if width > 1 else flat
+
+    delta = TopologyDelta(
+        node_parents=array_of('node_parents', np.int64, 4),
+        node_weights=array_of('node_weights', np.float64, 4),
+        moved_nodes=array_of('moved_nodes', np.int64, 1),
+        moved_parents=array_of('moved_parents', np.int64, 4),
+        moved_weights=array_of('moved_weights', np.float64, 4),
+        removed_tetrahedra=array_of('removed_tetrahedra', np.int64, 1),
+        tetrahedra=array_of('tetrahedra', np.int64, 4),
+        outer_faces=array_of('outer_faces', np.uint8, 1),
+    )
+    pairs = (
+        ('node_weights', delta.node_weights, delta.node_parents),
+        ('moved_parents', delta.moved_parents, delta.moved_nodes),
+        ('moved_weights', delta.moved_weights, delta.moved_nodes),
+        ('outer_faces', delta.outer_faces, delta.tetrahedra),
+    )
+    for name, values, rows in pairs:
+        if len(values) != len(rows):
+            raise ValueError(f'{name} has {len(values)} rows where {len(rows)} belong')
+    if not (np.isfinite(delta.node_weights).all() and np.isfinite(delta.moved_weights).all()):
+        raise ValueError('a weight is not finite')
+    return delta

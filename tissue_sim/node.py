@@ -1,0 +1,230 @@
+"""The node `tissue_sim`: the tissue at 30 Hz."""
+
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from cutting_trainer_msgs.msg import Contact, ForceSample, Mesh, MeshDelta
+from cutting_trainer_msgs.srv import Cut, GetMesh
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+
+from tissue_sim import messages, ros
+from tissue_sim.blade import Resistance
+from tissue_sim.errors import MeshError
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh, Touched
+from tissue_sim.mesh_io import load_tissue
+from tissue_sim.scene_file import read_section
+from tissue_sim.settings import TissueSettings
+from tissue_sim.simulation import Frame, TissueSimulation, ToolContact
+from tissue_sim.timing import PeriodicLoop
+from tissue_sim.warm_up import warm_up
+
+_CONTACT_AGE_NS = 100_000_000
+_KEYFRAME_SECONDS = 5.0
+_CUT_TIMEOUT_NS = 1_000_000_000
+
+
+def make_simulation(settings: TissueSettings) -> TissueSimulation:
+    """The simulation that a scene describes.
+
+    Args:
+        settings: its section `tissue`.
+
+    Raises:
+        MeshError: the mesh cannot be used.
+    """
+    nodes, tetrahedra, fixed = load_tissue(settings)
+    m, d = settings.material, settings.damping
+    return TissueSimulation(
+        TetMesh(nodes, tetrahedra, fixed),
+        Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
+        Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
+        rate=settings.integration.rate,
+        safety=settings.integration.safety,
+        max_substeps=settings.integration.max_substeps,
+        stretch=settings.stretch,
+        frequency_growth=settings.integration.frequency_growth,
+    )
+
+
+class TissueSimNode(Node):
+    """Owns the tissue; see docs/architecture.md for its topics."""
+
+    def __init__(self) -> None:
+        super().__init__('tissue_sim')
+        scene = Path(self.declare_parameter('scene', '').value)
+        self.declare_parameter('seed', 0)
+        settings = read_section(scene, 'tissue', TissueSettings)
+        self._scene = scene.stem
+        self._simulation = make_simulation(settings)
+        self._loop = PeriodicLoop(settings.integration.rate)
+        self._encoder = messages.DeltaEncoder(self._simulation.mesh, self._simulation.displacement)
+        self._lock = threading.Lock()
+        self._rejected: Counter[str] = Counter()
+        self._contact: Contact | None = None
+        self._contact_received = 0
+        self._touched: Touched | None = None
+        self._cut: Any = None
+        self._cut_sent = 0
+        self._cut_step = 0
+        self._next_keyframe = 0.0
+        self._frame: Frame | None = None
+        self._connect()
+
+    def _connect(self) -> None:
+        self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, ros.LATCHED)
+        self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
+        self._forces = self.create_publisher(ForceSample, ros.FORCE, ros.STREAM)
+        self._contacts = ros.polled(self, Contact, ros.CONTACT, ros.NEWEST_BEST_EFFORT)
+        self._cutting = self.create_client(Cut, ros.CUT)
+        self.create_service(GetMesh, ros.GET_MESH, self._serve_mesh)
+        self._diagnostics = ros.Diagnostics(self, self._status)
+
+    def work(self, stop: ros.Stop) -> None:
+        """Runs frames to the end."""
+        warm_up()
+        with self._lock:
+            self._publish_keyframe()
+        ros.announce_ready(self)
+        self._loop.start()
+        while not stop.is_set():
+            self._loop.wait()
+            with self._lock:
+                self._tick()
+
+    def _tick(self) -> None:
+        self._take_answer()
+        contact = self._newest_contact()
+        frame = self._simulation.frame(contact)
+        now = time.time_ns()
+        delta = self._encoder.encode(
+            self._simulation.displacement, frame.step, now, self._touched, self._cut_step
+        )
+        self._touched = None
+        self._frame = frame
+        if not frame.diverged:
+            self._forces.publish(
+                messages.force_message(
+                    frame,
+                    self._encoder.revision,
+                    self._simulation.mesh.topology,
+                    self._contact if contact is not None else None,
+                    now,
+                )
+            )
+        else:
+            self._rejected['diverged frame'] += 1
+        if delta is not None:
+            self._updates.publish(delta)
+        if time.monotonic() >= self._next_keyframe:
+            self._publish_keyframe()
+        if frame.command is not None:
+            self._ask(frame)
+
+    def _newest_contact(self) -> ToolContact | None:
+        message = ros.take(self._contacts)
+        now = time.monotonic_ns()
+        if message is not None:
+            self._contact, self._contact_received = message, now
+        if self._contact is None or now - self._contact_received > _CONTACT_AGE_NS:
+            return None
+        try:
+            return messages.tool_contact(self._contact, self._simulation.mesh.node_count)
+        except ValueError as error:
+            self._reject('contact', str(error))
+            return None
+
+    def _reject(self, what: str, why: str) -> None:
+        self._rejected[what] += 1
+        self.get_logger().warning(f'{what} refused: {why}', throttle_duration_sec=1.0)
+
+    def _ask(self, frame: Frame) -> None:
+        request = Cut.Request(command=int(frame.command or 0), revision=self._encoder.revision)
+        if frame.sweep is not None:
+            request.root_from, request.tip_from = frame.sweep.root_from, frame.sweep.tip_from
+            request.root_to, request.tip_to = frame.sweep.root_to, frame.sweep.tip_to
+        if not self._cutting.service_is_ready():
+            self._simulation.cut_failed()
+            self._reject('cut', 'the service cutting/cut is not there')
+            return
+        self._cut = self._cutting.call_async(request)
+        self._cut_sent = time.monotonic_ns()
+        self._cut_step = frame.step
+
+    def _take_answer(self) -> None:
+        if self._cut is None:
+            return
+        if not self._cut.done():
+            if time.monotonic_ns() - self._cut_sent > _CUT_TIMEOUT_NS:
+                self._cutting.remove_pending_request(self._cut)
+                self._cut = None
+                self._simulation.cut_failed()
+                self._reject('cut', 'no answer within 1 s')
+            return
+        response, self._cut = self._cut.result(), None
+        try:
+            if not response.success:
+                raise ValueError(response.error_msg)
+            if response.topology != self._simulation.mesh.topology:
+                raise ValueError(f'it is for topology {response.topology}')
+            delta = messages.delta_from(response)
+            if delta.empty:
+                self._simulation.cut_done()
+            else:
+                self._touched = self._simulation.apply_cut(delta)
+        except (ValueError, MeshError) as error:
+            self._simulation.cut_failed()
+            self._reject('cut', str(error))
+
+    def _publish_keyframe(self) -> None:
+        self._mesh_publisher.publish(self._mesh_message())
+        self._next_keyframe = time.monotonic() + _KEYFRAME_SECONDS
+
+    def _mesh_message(self) -> Mesh:
+        return messages.mesh_message(
+            self._simulation.mesh,
+            self._simulation.displacement,
+            self._scene,
+            self._encoder.revision,
+            self._simulation.step,
+            time.time_ns(),
+        )
+
+    def _serve_mesh(self, _: GetMesh.Request, response: GetMesh.Response) -> GetMesh.Response:
+        with self._lock:
+            response.mesh = self._mesh_message()
+        response.success = True
+        return response
+
+    def _status(self) -> tuple[bytes, str, dict[str, object]]:
+        values: dict[str, object] = dict(self._loop.report())
+        simulation, frame = self._simulation, self._frame
+        values |= {
+            'tetrahedra': len(simulation.mesh.tetrahedra),
+            'nodes': simulation.mesh.node_count,
+            'elements_cut': simulation.elements_cut,
+            'topology': simulation.mesh.topology,
+            'omega_bound': simulation.omega,
+        }
+        values |= {f'refused {what}': count for what, count in self._rejected.items()}
+        if frame is None:
+            return DiagnosticStatus.OK, 'starting', values
+        values |= {'substeps': frame.substeps, 'slow_motion': frame.slow_motion}
+        if frame.diverged:
+            return DiagnosticStatus.ERROR, 'a frame diverged and was taken back', values
+        if frame.slow_motion < 0.999:
+            return DiagnosticStatus.WARN, 'max_substeps is too small for real time', values
+        return DiagnosticStatus.OK, frame.state.name.lower(), values
+
+
+def main() -> None:
+    """Runs the node."""
+    ros.run(TissueSimNode, TissueSimNode.work)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,180 @@
+"""A copy of the tissue that follows the published revisions, for whoever does not own it."""
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from tissue_sim.mesh import grown
+
+
+def state_hash(rest: np.ndarray, displacement: np.ndarray, tetrahedra: np.ndarray) -> int:
+    """First 8 bytes, little endian, of BLAKE2b over rest, displacement and tetrahedra as sent.
+
+    Args:
+        rest, displacement: [m], float64, shape (n, 3).
+        tetrahedra: node indices, shape (m, 4).
+    """
+    digest = hashlib.blake2b(digest_size=8)
+    digest.update(np.ascontiguousarray(rest, np.float64).data)
+    digest.update(np.ascontiguousarray(displacement, np.float64).data)
+    digest.update(np.ascontiguousarray(tetrahedra, np.uint32).data)
+    return int.from_bytes(digest.digest(), 'little')
+
+
+class MeshReplica:
+    """Arrays rebuilt from `Mesh` and `MeshDelta` messages, or anything with the same fields.
+
+    Attributes:
+        revision, topology, step: of the last message; revision is -1 before the first.
+    """
+
+    def __init__(self) -> None:
+        self.revision = -1
+        self.topology = -1
+        self.step = 0
+        self._nodes = self._tets = self._tris = 0
+        self._rest = np.zeros((0, 3))
+        self._displacement = np.zeros((0, 3))
+        self._fixed = np.zeros(0, np.uint8)
+        self._tetrahedra = np.zeros((0, 4), np.int32)
+        self._triangles = np.zeros((0, 3), np.int32)
+        self._kind = np.zeros(0, np.uint8)
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Rest positions [m], shape (n, 3); a view."""
+        return self._rest[: self._nodes]
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """Displacements [m], shape (n, 3); a view."""
+        return self._displacement[: self._nodes]
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """1 where the node does not move, shape (n,); a view."""
+        return self._fixed[: self._nodes]
+
+    @property
+    def tetrahedra(self) -> np.ndarray:
+        """Node indices, shape (m, 4); a view."""
+        return self._tetrahedra[: self._tets]
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """Surface triangles, outward counter-clockwise, shape (k, 3); a view."""
+        return self._triangles[: self._tris]
+
+    @property
+    def triangle_kind(self) -> np.ndarray:
+        """OUTER or CUT by surface triangle, shape (k,); a view."""
+        return self._kind[: self._tris]
+
+    def positions(self) -> np.ndarray:
+        """Current positions [m], shape (n, 3); a new array."""
+        return self.rest + self.displacement
+
+    def hash(self) -> int:
+        """`state_hash` of what the replica holds."""
+        return state_hash(self.rest, self.displacement, self.tetrahedra)
+
+    def load(self, mesh: Any) -> None:
+        """Takes a full mesh.
+
+        Args:
+            mesh: a `Mesh` message.
+
+        Raises:
+            ValueError: its arrays do not fit each other.
+        """
+        n, remainder = divmod(len(mesh.rest), 3)
+        tets = _indices(mesh.tetrahedra, 4, n, 'tetrahedra')
+        tris = _indices(mesh.triangles, 3, n, 'triangles')
+        lengths = (
+            ('rest', remainder, 0),
+            ('displacement', len(mesh.displacement), 3 * n),
+            ('fixed', len(mesh.fixed), n),
+            ('triangle_kind', len(mesh.triangle_kind), len(tris)),
+        )
+        for name, have, want in lengths:
+            if have != want:
+                raise ValueError(f'mesh field {name} has a length that does not fit {n} nodes')
+        self._nodes, self._tets, self._tris = n, len(tets), len(tris)
+        self._rest = np.array(mesh.rest, float).reshape(-1, 3)
+        self._displacement = np.array(mesh.displacement, float).reshape(-1, 3)
+        self._fixed = np.array(mesh.fixed, np.uint8)
+        self._tetrahedra, self._triangles = tets, tris
+        self._kind = np.array(mesh.triangle_kind, np.uint8)
+        self.revision, self.topology, self.step = mesh.revision, mesh.topology, mesh.step
+
+    def apply(self, delta: Any) -> bool:
+        """Takes one delta.
+
+        Args:
+            delta: a `MeshDelta` message.
+
+        Returns:
+            False when it does not start from this revision: then nothing is changed, and the full
+            mesh is needed. A delta that this revision already contains is passed over with True.
+
+        Raises:
+            ValueError: its arrays do not fit each other; nothing is changed.
+        """
+        if delta.revision <= self.revision:
+            return True
+        if delta.base_revision != self.revision:
+            return False
+        n, m, k = delta.node_count, delta.tetrahedron_count, delta.triangle_count
+        everything = len(delta.displaced) == 0 and len(delta.displacement) > 0
+        rest_at = _slots(delta.rest_changed, n, 'rest_changed')
+        tets_at = _slots(delta.tetrahedra_changed, m, 'tetrahedra_changed')
+        tris_at = _slots(delta.triangles_changed, k, 'triangles_changed')
+        moved_at = np.arange(n) if everything else _slots(delta.displaced, n, 'displaced')
+        tets = _indices(delta.tetrahedra, 4, n, 'tetrahedra')
+        tris = _indices(delta.triangles, 3, n, 'triangles')
+        lengths = (
+            ('displacement', len(delta.displacement), 3 * len(moved_at)),
+            ('rest', len(delta.rest), 3 * len(rest_at)),
+            ('fixed', len(delta.fixed), len(rest_at)),
+            ('tetrahedra', len(tets), len(tets_at)),
+            ('triangles', len(tris), len(tris_at)),
+            ('triangle_kind', len(delta.triangle_kind), len(tris_at)),
+        )
+        for name, have, want in lengths:
+            if have != want:
+                raise ValueError(f'mesh delta field {name} has {have} values where {want} belong')
+        self._resize(n, m, k)
+        self._rest[rest_at] = np.array(delta.rest, float).reshape(-1, 3)
+        self._fixed[rest_at] = np.array(delta.fixed, np.uint8)
+        self._tetrahedra[tets_at] = tets
+        self._triangles[tris_at] = tris
+        self._kind[tris_at] = np.array(delta.triangle_kind, np.uint8)
+        self._displacement[moved_at] = np.array(delta.displacement, float).reshape(-1, 3)
+        self.revision, self.topology, self.step = delta.revision, delta.topology, delta.step
+        return True
+
+    def _resize(self, n: int, m: int, k: int) -> None:
+        self._rest = grown(self._rest, n)
+        self._displacement = grown(self._displacement, n)
+        self._fixed = grown(self._fixed, n)
+        self._tetrahedra = grown(self._tetrahedra, m)
+        self._triangles = grown(self._triangles, k)
+        self._kind = grown(self._kind, k)
+        self._nodes, self._tets, self._tris = n, m, k
+
+
+def _slots(values: Any, limit: int, name: str) -> np.ndarray:
+    slots = np.array(values, np.int64)
+    if len(slots) and slots.max() >= limit:
+        raise ValueError(f'mesh delta field {name} has slot {slots.max()} of {limit}')
+    return slots
+
+
+def _indices(values: Any, width: int, nodes: int, name: str) -> np.ndarray:
+    flat = np.array(values, np.int64)
+    if len(flat) % width:
+        raise ValueError(f'mesh field {name} has {len(flat)} values, not a multiple of {width}')
+    if len(flat) and flat.max() >= nodes:
+        raise ValueError(f'mesh field {name} has node {flat.max()} of {nodes}')
+    return flat.astype(np.int32).reshape(-1, width)

@@ -1,0 +1,316 @@
+"""The linear tensor-mass model: node and edge tensors gathered from the stars of the nodes.
+
+Cotin 2000; thesis 4.3. The stiffness is kept as the symmetric 3x3 tensor of each node and the
+tensor of each edge (i, j), i < j, in the row of i; the transpose serves row j. Rows have slack, so
+that a cut changes the rows it touches and no other.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh, grown
+
+_SLACK = 4
+
+
+class Tensors(NamedTuple):
+    """The arrays of the model; row i of a node spans `start[i]` to `start[i] + used[i]`.
+
+    Attributes:
+        diagonal: node tensors [N/m], xx xy xz yy yz zz, shape (n, 6).
+        mass: lumped masses [kg] (thesis eq. 4.2), shape (n,).
+        start, used, room: first slot, used slots and slots of each row, shape (n,).
+        columns: three times the node j of each edge tensor, shape (c,).
+        blocks: edge tensors K_ij [N/m], row-major, shape (9 c,).
+    """
+
+    diagonal: np.ndarray
+    mass: np.ndarray
+    start: np.ndarray
+    used: np.ndarray
+    room: np.ndarray
+    columns: np.ndarray
+    blocks: np.ndarray
+
+
+@njit(cache=True)
+def shape_gradients(rest, tetrahedra, tet, gradients):
+    """Gradients of the four linear shape functions of a tetrahedron.
+
+    They are the M vectors of the thesis over 6 V; eq. 4.8 as printed lacks a factor (-1)^j.
+
+    Args:
+        rest: rest positions [m], shape (n, 3).
+        tetrahedra: shape (m, 4).
+        tet: which one.
+        gradients: output [1/m], shape (4, 3).
+
+    Returns:
+        Signed volume [m^3].
+    """
+    o, p, q, r = tetrahedra[tet, 0], tetrahedra[tet, 1], tetrahedra[tet, 2], tetrahedra[tet, 3]
+    ax, ay, az = rest[p, 0] - rest[o, 0], rest[p, 1] - rest[o, 1], rest[p, 2] - rest[o, 2]
+    bx, by, bz = rest[q, 0] - rest[o, 0], rest[q, 1] - rest[o, 1], rest[q, 2] - rest[o, 2]
+    cx, cy, cz = rest[r, 0] - rest[o, 0], rest[r, 1] - rest[o, 1], rest[r, 2] - rest[o, 2]
+    g = gradients
+    g[1, 0], g[1, 1], g[1, 2] = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    g[2, 0], g[2, 1], g[2, 2] = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+    g[3, 0], g[3, 1], g[3, 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    determinant = ax * g[1, 0] + ay * g[1, 1] + az * g[1, 2]
+    for i in range(3):
+        for k in range(1, 4):
+            g[k, i] /= determinant
+        g[0, i] = -(g[1, i] + g[2, i] + g[3, i])
+    return determinant / 6.0
+
+
+@njit(cache=True)
+def _edge_slot(tensors, node, column):
+    """The slot of an edge in the row of `node`, made if there is room; -1 if there is none."""
+    first = tensors.start[node]
+    for slot in range(first, first + tensors.used[node]):
+        if tensors.columns[slot] == column:
+            return slot
+    if tensors.used[node] == tensors.room[node]:
+        return -1
+    slot = first + tensors.used[node]
+    tensors.used[node] += 1
+    tensors.columns[slot] = column
+    for i in range(9):
+        tensors.blocks[9 * slot + i] = 0.0
+    return slot
+
+
+@njit(cache=True)
+def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu, density):
+    """Computes the rows and masses of some nodes from their stars.
+
+    Thesis eq. 4.7, transposed as it must be:
+    K_jk = V (lambda g_j g_k^T + mu g_k g_j^T + mu (g_j . g_k) I) is the force on j by the
+    displacement of k.
+
+    Args:
+        tensors: written for `nodes` only.
+        links: connectivity.
+        rest: rest positions [m], shape (n, 3).
+        nodes: which rows, shape (r,).
+        lame_lambda, lame_mu: [Pa].
+        density: [kg/m^3].
+
+    Returns:
+        Index into `nodes` of the first whose row has no room, or -1.
+    """
+    g = np.empty((4, 3))
+    for which in range(len(nodes)):
+        node = nodes[which]
+        tensors.used[node] = 0
+        tensors.mass[node] = 0.0
+        for i in range(6):
+            tensors.diagonal[node, i] = 0.0
+        corner = links.first_corner[node]
+        while corner >= 0:
+            tet, a = corner // 4, corner % 4
+            volume = shape_gradients(rest, links.tetrahedra, tet, g)
+            tensors.mass[node] += 0.25 * density * volume
+            dot = volume * lame_mu * (g[a, 0] * g[a, 0] + g[a, 1] * g[a, 1] + g[a, 2] * g[a, 2])
+            both = volume * (lame_lambda + lame_mu)
+            tensors.diagonal[node, 0] += both * g[a, 0] * g[a, 0] + dot
+            tensors.diagonal[node, 1] += both * g[a, 0] * g[a, 1]
+            tensors.diagonal[node, 2] += both * g[a, 0] * g[a, 2]
+            tensors.diagonal[node, 3] += both * g[a, 1] * g[a, 1] + dot
+            tensors.diagonal[node, 4] += both * g[a, 1] * g[a, 2]
+            tensors.diagonal[node, 5] += both * g[a, 2] * g[a, 2] + dot
+            for b in range(4):
+                other = links.tetrahedra[tet, b]
+                if other > node:
+                    slot = _edge_slot(tensors, node, 3 * other)
+                    if slot < 0:
+                        return which
+                    dot = g[a, 0] * g[b, 0] + g[a, 1] * g[b, 1] + g[a, 2] * g[b, 2]
+                    for i in range(3):
+                        for k in range(3):
+                            value = lame_lambda * g[a, i] * g[b, k] + lame_mu * g[b, i] * g[a, k]
+                            if i == k:
+                                value += lame_mu * dot
+                            tensors.blocks[9 * slot + 3 * i + k] += volume * value
+            corner = links.corner_next[corner]
+    return -1
+
+
+_U1, _U2, _U3, _U6, _U9 = (np.uint64(i) for i in (1, 2, 3, 6, 9))
+_U4, _U5, _U7, _U8 = (np.uint64(i) for i in (4, 5, 7, 8))
+
+
+@njit(cache=True, fastmath=True, error_model='numpy')
+def multiply(start, used, columns, blocks, diagonal, u, f):
+    """Product f = K u with the symmetric halves of K.
+
+    Unsigned indices: a sign test for each access costs a third.
+
+    Args:
+        start, used, columns, blocks: rows as in `Tensors`.
+        diagonal: node tensors, flat, shape (6 n,).
+        u: displacement by coordinate [m], shape (3 n,).
+        f: output [N], shape (3 n,).
+    """
+    for i in range(f.shape[0]):
+        f[i] = 0.0
+    for i in range(used.shape[0]):
+        row = _U3 * np.uint64(i)
+        x0, y0, w0 = u[row], u[row + _U1], u[row + _U2]
+        q = _U6 * np.uint64(i)
+        a0 = diagonal[q] * x0 + diagonal[q + _U1] * y0 + diagonal[q + _U2] * w0
+        a1 = diagonal[q + _U1] * x0 + diagonal[q + _U3] * y0 + diagonal[q + _U4] * w0
+        a2 = diagonal[q + _U2] * x0 + diagonal[q + _U4] * y0 + diagonal[q + _U5] * w0
+        first = np.uint64(start[i])
+        for k in range(first, first + np.uint64(used[i])):
+            j = np.uint64(columns[k])
+            q = _U9 * np.uint64(k)
+            b0, b1, b2 = blocks[q], blocks[q + _U1], blocks[q + _U2]
+            b3, b4, b5 = blocks[q + _U3], blocks[q + _U4], blocks[q + _U5]
+            b6, b7, b8 = blocks[q + _U6], blocks[q + _U7], blocks[q + _U8]
+            x, y, w = u[j], u[j + _U1], u[j + _U2]
+            a0 += b0 * x + b1 * y + b2 * w
+            a1 += b3 * x + b4 * y + b5 * w
+            a2 += b6 * x + b7 * y + b8 * w
+            f[j] += b0 * x0 + b3 * y0 + b6 * w0
+            f[j + _U1] += b1 * x0 + b4 * y0 + b7 * w0
+            f[j + _U2] += b2 * x0 + b5 * y0 + b8 * w0
+        f[row] += a0
+        f[row + _U1] += a1
+        f[row + _U2] += a2
+
+
+class TensorMassModel:
+    """Linear elasticity on a mesh that is cut (thesis 4.3, as corrected in docs/method.md).
+
+    Limitations: forces are right for small rotations only (an element that turns by theta feels a
+    strain cos(theta) - 1), and linear tetrahedra lock as nu approaches 0.5.
+
+    Args:
+        mesh: the mesh; the model follows it by `update`.
+        material: its constants.
+    """
+
+    def __init__(self, mesh: TetMesh, material: Material) -> None:
+        self.mesh = mesh
+        self.material = material
+        self.rebuild()
+
+    def rebuild(self) -> None:
+        """Computes every row anew, packed in the order of the nodes."""
+        n = self.mesh.node_count
+        room = np.zeros(n, np.int64)
+        tets = np.sort(self.mesh.tetrahedra, axis=1).astype(np.int64)
+        pairs = np.concatenate([tets[:, [i, j]] for i in range(4) for j in range(i + 1, 4)])
+        edges = np.unique(pairs[:, 0] * n + pairs[:, 1])
+        np.add.at(room, edges // n, 1)
+        room += _SLACK
+        start = np.concatenate([[0], np.cumsum(room)[:-1]])
+        slots = int(room.sum())
+        self.tensors = Tensors(
+            np.zeros((n, 6)),
+            np.zeros(n),
+            start,
+            np.zeros(n, np.int64),
+            room,
+            np.zeros(slots, np.uint32),
+            np.zeros(9 * slots),
+        )
+        self._used = slots
+        self._gather(np.arange(n))
+
+    def update(self, nodes: np.ndarray) -> None:
+        """Computes the rows of the nodes that a change of connectivity touched, and no other.
+
+        Args:
+            nodes: `Touched.nodes` of the batch, shape (r,).
+        """
+        n = self.mesh.node_count
+        t = self.tensors
+        known = len(t.room)
+        self.tensors = t._replace(
+            diagonal=grown(t.diagonal, n),
+            mass=grown(t.mass, n),
+            start=grown(t.start, n),
+            used=grown(t.used, n),
+            room=grown(t.room, n),
+        )
+        if len(self.tensors.room) > known:
+            self.tensors.room[known:] = 0
+        self._gather(np.asarray(nodes, np.int64))
+        if self._used > 4 * int(self.tensors.used[:n].sum()) + 4096:
+            self.rebuild()
+
+    def _gather(self, nodes: np.ndarray) -> None:
+        m = self.material
+        remaining = nodes
+        while len(remaining):
+            full = gather_rows(
+                self.tensors,
+                self.mesh.links,
+                self.mesh.rest,
+                remaining,
+                m.lame_lambda,
+                m.lame_mu,
+                m.density,
+            )
+            if full < 0:
+                return
+            self._give_room(int(remaining[full]))
+            remaining = remaining[full:]
+
+    def _give_room(self, node: int) -> None:
+        room = 2 * int(self.tensors.room[node]) + 16
+        t = self.tensors
+        self.tensors = t._replace(
+            columns=grown(t.columns, self._used + room),
+            blocks=grown(t.blocks, 9 * (self._used + room)),
+        )
+        self.tensors.start[node] = self._used
+        self.tensors.room[node] = room
+        self._used += room
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Lumped masses [kg], shape (n,); a view."""
+        return self.tensors.mass[: self.mesh.node_count]
+
+    @property
+    def operands(self) -> tuple[np.ndarray, ...]:
+        """What `multiply` takes before u and f: start, used, columns, blocks, diagonal (flat)."""
+        n = self.mesh.node_count
+        t = self.tensors
+        return t.start[:n], t.used[:n], t.columns, t.blocks, t.diagonal[:n].ravel()
+
+    def force(self, u: np.ndarray) -> np.ndarray:
+        """Elastic force K u that resists a displacement (the internal force is its negative).
+
+        Args:
+            u: displacement [m], shape (n, 3).
+
+        Returns:
+            [N], shape (n, 3).
+        """
+        f = np.empty(3 * self.mesh.node_count)
+        multiply(*self.operands, np.ascontiguousarray(u, float).ravel(), f)
+        return f.reshape(-1, 3)
+
+    def dense(self) -> np.ndarray:
+        """The stiffness matrix [N/m], shape (3 n, 3 n); for small meshes and tests."""
+        n = self.mesh.node_count
+        t = self.tensors
+        k = np.zeros((3 * n, 3 * n))
+        xx, xy, xz, yy, yz, zz = t.diagonal[:n].T
+        nodes = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+        for i in range(n):
+            k[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = nodes[i]
+            for slot in range(t.start[i], t.start[i] + t.used[i]):
+                j = int(t.columns[slot])
+                block = t.blocks[9 * slot : 9 * slot + 9].reshape(3, 3)
+                k[3 * i : 3 * i + 3, j : j + 3] = block
+                k[j : j + 3, 3 * i : 3 * i + 3] = block.T
+        return k

@@ -1,0 +1,112 @@
+"""Absolute deadlines for periodic loops, and what became of them."""
+
+import os
+import time
+
+import numpy as np
+
+NANOSECONDS = 1_000_000_000
+
+
+class PeriodicLoop:
+    """Sleeps to absolute deadlines and keeps the statistics of one loop.
+
+    A loop that oversleeps a whole period skips the deadlines that have passed and counts them as
+    missed: it never runs twice at once to catch up.
+
+    Args:
+        rate: deadlines a second [Hz].
+        window: how many periods the statistics of `report` cover.
+    """
+
+    def __init__(self, rate: float, *, window: int = 4096) -> None:
+        self.period_ns = round(NANOSECONDS / rate)
+        self.missed = 0
+        self.ticks = 0
+        self._starts = np.zeros(window, np.int64)
+        self._lateness = np.zeros(window, np.int64)
+        self._busy = np.zeros(window, np.int64)
+        self._reported = 0
+        self._deadline = 0
+        self._woken = 0
+
+    def start(self) -> None:
+        """Sets the first deadline one period from now."""
+        self._deadline = time.monotonic_ns() + self.period_ns
+
+    def wait(self) -> int:
+        """Sleeps to the next deadline.
+
+        Returns:
+            How late the loop woke after it [ns].
+        """
+        now = time.monotonic_ns()
+        if self.ticks:
+            self._busy[(self.ticks - 1) % len(self._busy)] = now - self._woken
+        if now < self._deadline:
+            time.sleep((self._deadline - now) / NANOSECONDS)
+            now = time.monotonic_ns()
+        late = now - self._deadline
+        skipped = max(late, 0) // self.period_ns
+        self.missed += skipped
+        self._deadline += (skipped + 1) * self.period_ns
+        slot = self.ticks % len(self._starts)
+        self._starts[slot] = now
+        self._lateness[slot] = late
+        self._woken = now
+        self.ticks += 1
+        return late
+
+    def report(self) -> dict[str, float]:
+        """Statistics of the ticks since the last report, at most `window` of them.
+
+        Returns:
+            rate [Hz], period_p50, period_p99, period_max [s], lateness_p50, lateness_p99,
+            lateness_p999, lateness_max [s], busy_p50, busy_p99, busy_max [s] (work between two
+            sleeps), within (share of periods within half a period of the nominal one), ticks and
+            missed (totals).
+        """
+        count = min(self.ticks - self._reported, len(self._starts))
+        self._reported = self.ticks
+        totals = {'ticks': float(self.ticks), 'missed': float(self.missed)}
+        if count < 3:
+            return totals
+        slots = np.arange(self.ticks - count, self.ticks) % len(self._starts)
+        periods = np.diff(self._starts[slots]) / NANOSECONDS
+        lateness = self._lateness[slots] / NANOSECONDS
+        busy = self._busy[slots[:-1]] / NANOSECONDS
+        nominal = self.period_ns / NANOSECONDS
+        return totals | {
+            'rate': float(1 / periods.mean()),
+            'within': float(np.mean(np.abs(periods - nominal) <= nominal / 2)),
+            **_quantiles('period', periods, (50, 99)),
+            **_quantiles('lateness', lateness, (50, 99, 99.9)),
+            **_quantiles('busy', busy, (50, 99)),
+        }
+
+
+def _quantiles(name: str, values: np.ndarray, percents: tuple[float, ...]) -> dict[str, float]:
+    named = {
+        f'{name}_p{str(p).replace(".", "")}': float(q)
+        for p, q in zip(percents, np.percentile(values, percents), strict=True)
+    }
+    return named | {f'{name}_max': float(values.max())}
+
+
+def request_real_time(priority: int) -> str:
+    """Asks for SCHED_FIFO for the calling thread.
+
+    Returns:
+        A sentence for the log: what was granted, or why not and what to do.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        return (
+            'real-time scheduling is not allowed for this user: expect wake-up delays of '
+            'milliseconds under load; allow it with "rtprio 80" in /etc/security/limits.d and log '
+            'in again'
+        )
+    except (AttributeError, OSError) as error:
+        return f'real-time scheduling is not available here: {error}'
+    return f'real-time scheduling granted: SCHED_FIFO, priority {priority}'
