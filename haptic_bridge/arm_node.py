@@ -1,0 +1,170 @@
+"""Node `emulated_arm`: a haptic device after CRTK, with an operator's hand on it."""
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+from rclpy.node import Node
+
+from haptic_bridge.arm import EmulatedArm
+from haptic_bridge.arm_settings import ArmSettings
+from haptic_bridge.crtk import StateInterface
+from haptic_bridge.hand import Hand, compile_script
+from haptic_bridge.operating_state import OperatingStateMachine, State, crtk_types
+from haptic_bridge.realtime import prepare, run_real_time
+from haptic_bridge.settings import DeviceSettings
+from haptic_bridge.wire import PoseStampedCodec, TwistStampedCodec, WireError, WrenchStampedCodec
+from tissue_sim.ros import (
+    ARM,
+    LATCHED,
+    NEWEST_BEST_EFFORT,
+    STREAM,
+    Diagnostics,
+    Stop,
+    announce_ready,
+    polled,
+    run,
+    take_raw,
+)
+from tissue_sim.scene_file import read_section
+from tissue_sim.timing import PeriodicLoop
+
+_LONGEST_CATCH_UP = 50
+_NO_TORQUE = (0.0, 0.0, 0.0)
+
+
+class ArmNode(Node):
+    """Publishes where the arm is, takes the force for the hand.
+
+    Parameters:
+        scene: path of the scene file.
+        seconds: [s] duration of the script; 0: as in the scene.
+        seed: of the tremor.
+        auto_enable: start in the state ENABLED.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('emulated_arm')
+        scene = Path(self.declare_parameter('scene', '').value)
+        seconds = float(self.declare_parameter('seconds', 0.0).value)
+        seed = self.declare_parameter('seed', 0).value
+        if not math.isfinite(seconds) or seconds < 0:
+            raise ValueError(f'parameter seconds is {seconds}: use 0 or a duration')
+        settings = read_section(scene, 'arm', ArmSettings)
+        device = read_section(scene, 'device', DeviceSettings)
+        script = compile_script(settings.script, device.tissue_from_device, seconds)
+        body_force = device.force_frame == 'body'
+
+        def new_arm() -> EmulatedArm:
+            hand = Hand(settings.hand, script, seed)
+            return EmulatedArm(settings, hand, body_force=body_force)
+
+        new_arm().advance(0, enabled=False)  # compiles the kernels before the clock runs
+        self._arm = new_arm()
+        self._script = script
+        self._machine = OperatingStateMachine()
+        if self.declare_parameter('auto_enable', True).value:
+            self._machine.command('enable')
+        self._loop = PeriodicLoop(settings.rate)
+        self._missed = 0
+        self._bridge_enabled = False
+        self._done = False
+        self._connect(settings.frame_id)
+
+    def _connect(self, frame_id: str) -> None:
+        self._cp = PoseStampedCodec(frame_id)
+        self._cv = TwistStampedCodec(frame_id)
+        self._cf = WrenchStampedCodec(frame_id)
+        self._measured_cp = self.create_publisher(PoseStamped, f'{ARM}/measured_cp', STREAM)
+        self._measured_cv = self.create_publisher(TwistStamped, f'{ARM}/measured_cv', STREAM)
+        self._measured_cf = self.create_publisher(WrenchStamped, f'{ARM}/measured_cf', STREAM)
+        self._servo_cf = polled(self, WrenchStamped, f'{ARM}/servo_cf', NEWEST_BEST_EFFORT)
+        self._states = StateInterface(self, ARM, self._machine)
+        self._bridge = self.create_subscription(
+            crtk_types().operating_state,
+            'haptic_bridge/operating_state',
+            self._bridge_state,
+            LATCHED,
+        )
+        self._real_time = ''
+        self._diagnostics = Diagnostics(self, self._status)
+
+    def work(self, stop: Stop) -> None:
+        """Runs the loop of the arm in the calling thread."""
+        self._real_time = prepare()
+        self.get_logger().info(self._real_time)
+        self._tick(0)
+        announce_ready(self)
+        run_real_time(self._loop, self._tick, stop)
+
+    def close(self) -> None:
+        """Publishes the last totals."""
+        self._diagnostics.publish()
+
+    def _tick(self, _late_ns: int) -> None:
+        arm, now = self._arm, time.monotonic_ns()
+        self._take_command(now)
+        if not arm.script_running and self._bridge_enabled and arm.commanded:
+            arm.script_running = True
+        passed = 1 + self._loop.missed - self._missed
+        self._missed = self._loop.missed
+        enabled = self._machine.state is State.ENABLED
+        arm.advance(now, enabled=enabled, steps=min(passed, _LONGEST_CATCH_UP))
+        self._publish(time.time_ns())
+        self._states.publish_changes()
+        if arm.script_over and not self._done:
+            self._done = True
+            print(f'done: {self.get_name()}', flush=True)
+
+    def _take_command(self, now: int) -> None:
+        data = take_raw(self._servo_cf)
+        if data is None:
+            return
+        try:
+            stamp, _, values = self._cf.decode(data)
+        except WireError as error:
+            self._arm.reject()
+            self.get_logger().error(str(error), throttle_duration_sec=1.0)
+        else:
+            self._arm.command(stamp, values[:3], now)
+
+    def _publish(self, stamp: int) -> None:
+        arm = self._arm
+        pose = (*arm.position.tolist(), *arm.orientation.tolist())
+        twist = (*arm.velocity.tolist(), *arm.angular_velocity.tolist())
+        self._measured_cp.publish(self._cp.encode(stamp, pose))
+        self._measured_cv.publish(self._cv.encode(stamp, twist))
+        self._measured_cf.publish(self._cf.encode(stamp, (*arm.force.tolist(), *_NO_TORQUE)))
+
+    def _bridge_state(self, message: Any) -> None:
+        self._bridge_enabled = message.state == State.ENABLED
+
+    def _status(self) -> tuple[bytes, str, dict[str, object]]:
+        arm, machine = self._arm, self._machine
+        name, kind = self._script.phase_at(arm.script_time)
+        values = self._loop.report() | {
+            'state': machine.state,
+            'real_time': self._real_time,
+            'watchdog_trips': arm.watchdog_trips,
+            'rejected': arm.rejected,
+            'force_norm': math.hypot(*arm.force.tolist()),
+            'phase': name,
+            'phase_kind': kind,
+            'script_time': arm.script_time,
+            'script_seconds': self._script.seconds,
+        }
+        if arm.watchdog_trips and not arm.commanded:
+            return DiagnosticStatus.WARN, 'servo_cf has stopped: no force on the hand', values
+        return DiagnosticStatus.OK, machine.reason or str(machine.state), values
+
+
+def main() -> None:
+    """Entry point of the process."""
+    run(ArmNode, ArmNode.work)
+
+
+if __name__ == '__main__':
+    main()

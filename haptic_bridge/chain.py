@@ -1,0 +1,186 @@
+"""The compiled part of one tick: pose to tissue frame, force law, safety chain, force to device."""
+
+import numpy as np
+from numba import njit
+
+from haptic_bridge import extrapolation, safety
+from haptic_bridge.settings import DeviceProfile, DeviceSettings, HapticsSettings, ToolSettings
+
+NONE, TOUCHING, INSIDE = range(3)
+"""Contact states, as in `Contact`."""
+
+_VELOCITY_FILTER = 0.005
+"""[s] time constant of the velocity that is damped: encoder steps are coarse at 1 kHz."""
+
+SETUP = np.dtype(
+    [
+        ('rotation', 'f8', (3, 3)),  # device frame to tissue frame
+        ('translation', 'f8', (3,)),  # [m]
+        ('scale', 'f8'),
+        ('force_scale', 'f8'),
+        ('blade', 'f8', (2, 3)),  # root and tip [m], tool frame
+        ('coupling', 'f8'),  # [N/m]
+        ('period', 'f8'),  # [s] of the loop
+        ('law', 'i8'),
+        ('max_stiffness', 'f8'),  # [N/m], of the tissue
+        ('max_damping', 'f8'),  # [N s/m]
+        ('max_force', 'f8'),  # [N]
+        ('max_slew', 'f8'),  # [N/s]
+        ('body_frame', 'i8'),
+    ]
+)
+STATE = np.dtype(
+    [
+        ('device', 'f8', (3,)),  # [m], device frame
+        ('orientation', 'f8', (4,)),  # x y z w, device frame
+        ('tip', 'f8', (3,)),  # [m], tissue frame
+        ('blade', 'f8', (2, 3)),  # root and tip [m], tissue frame
+        ('moved', 'f8', (3,)),  # [m] since the last tick, device frame
+        ('velocity', 'f8', (3,)),  # [m/s], device frame
+        ('proxy', 'f8', (3,)),  # [m]
+        ('normal', 'f8', (3,)),
+        ('external', 'f8', (3,)),  # [N] on the tissue
+        ('resistance', 'f8'),  # [N]
+        ('energy', 'f8'),  # [J] of the passivity observer
+        ('damping', 'f8'),  # [N s/m] of the passivity controller
+        ('force', 'f8', (3,)),  # [N] commanded, device base frame
+        ('wrench', 'f8', (3,)),  # [N] the same in the frame that the device expects
+    ]
+)
+
+
+def make_setup(
+    tool: ToolSettings, device: DeviceSettings, haptics: HapticsSettings, profile: DeviceProfile
+) -> np.ndarray:
+    """What stays the same through a session, as the kernels read it: dtype SETUP, shape (1,)."""
+    frame = device.tissue_from_device
+    setup = np.zeros(1, SETUP)
+    setup['rotation'] = frame.rotation()
+    setup['translation'] = frame.translation
+    setup['scale'] = frame.scale
+    setup['force_scale'] = haptics.force_scale
+    setup['blade'] = (tool.blade_root, tool.blade_tip)
+    setup['coupling'] = tool.coupling_stiffness
+    setup['period'] = 1 / haptics.rate
+    setup['law'] = extrapolation.LAWS[haptics.extrapolation]
+    # The tissue is felt through the coupling spring: no slope steeper than that is real.
+    rendered = profile.max_stiffness / (frame.scale * haptics.force_scale)
+    setup['max_stiffness'] = min(rendered, tool.coupling_stiffness)
+    setup['max_damping'] = haptics.max_damping
+    setup['max_force'] = profile.max_force
+    setup['max_slew'] = profile.max_slew
+    setup['body_frame'] = device.force_frame == 'body'
+    return setup
+
+
+@njit(cache=True, nogil=True)
+def _rotate(q: np.ndarray, v: np.ndarray, sign: float, out: np.ndarray) -> None:
+    """Rotates v by the quaternion q (x y z w), or back with sign -1. Shapes (4,), (3,), (3,)."""
+    x, y, z, w = sign * q[0], sign * q[1], sign * q[2], q[3]
+    a = 2.0 * (y * v[2] - z * v[1])
+    b = 2.0 * (z * v[0] - x * v[2])
+    c = 2.0 * (x * v[1] - y * v[0])
+    out[0], out[1], out[2] = (
+        v[0] + w * a + y * c - z * b,
+        v[1] + w * b + z * a - x * c,
+        v[2] + w * c + x * b - y * a,
+    )
+
+
+@njit(cache=True, nogil=True)
+def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
+    """Takes a checked device pose: position [m] and quaternion, shape (7,)."""
+    c, s = setup[0], state[0]
+    for k in range(3):
+        s.moved[k] += values[k] - s.device[k]
+        s.device[k] = values[k]
+    for k in range(4):
+        s.orientation[k] = values[3 + k]
+    arm = np.empty(3)
+    for k in range(3):
+        s.tip[k] = c.translation[k]
+        for j in range(3):
+            s.tip[k] += c.scale * c.rotation[k, j] * values[j]
+    for end in range(2):
+        _rotate(s.orientation, c.blade[end], 1.0, arm)
+        for k in range(3):
+            s.blade[end, k] = s.tip[k]
+            for j in range(3):
+                s.blade[end, k] += c.rotation[k, j] * arm[j]
+
+
+@njit(cache=True, nogil=True)
+def _tissue_force(
+    setup: np.ndarray,
+    state: np.ndarray,
+    history: np.ndarray,
+    contact: int,
+    time: int,
+    out: np.ndarray,
+) -> None:
+    """Force law: what the tissue does to the tool now [N], tissue frame, shape (3,)."""
+    c, s, h = setup[0], state[0], history[0]
+    out[:] = 0.0
+    if contact == NONE:
+        return
+    if h.count > 0:
+        extrapolation.estimate(c.law, history, time, s.tip, c.max_stiffness, out)
+    elif contact == TOUCHING:
+        # The tissue has not answered this contact yet: the proxy's spring, no stiffer than it.
+        out[:] = s.proxy - s.tip
+        stiffness = extrapolation.directional_stiffness(h.stiffness, out)
+        if not 0.0 < stiffness < c.coupling:
+            stiffness = c.coupling
+        for k in range(3):
+            out[k] *= stiffness
+    if contact == TOUCHING:
+        outward = out[0] * s.normal[0] + out[1] * s.normal[1] + out[2] * s.normal[2]
+        if outward < 0.0:
+            out[:] = 0.0
+    else:
+        # The blade transmits no more than what it cuts at: nothing, while no part is in tissue.
+        safety.clamp(s.resistance, out)
+
+
+@njit(cache=True, nogil=True)
+def command(
+    setup: np.ndarray,
+    state: np.ndarray,
+    history: np.ndarray,
+    contact: int,
+    enabled: bool,
+    time: int,
+    gain: float,
+    elapsed: float,
+) -> bool:
+    """The chain behind the gates of the input; writes force and wrench.
+
+    Returns:
+        False where the result was not finite; the force is then zero.
+    """
+    c, s = setup[0], state[0]
+    s.energy = safety.observe(s.energy, s.force, s.moved)
+    weight = elapsed / (elapsed + _VELOCITY_FILTER)
+    for k in range(3):
+        s.velocity[k] += weight * (s.moved[k] / elapsed - s.velocity[k])
+        s.moved[k] = 0.0
+        s.external[k] = c.coupling * (s.tip[k] - s.proxy[k])
+    felt = np.zeros(3)
+    wanted = np.zeros(3)
+    _tissue_force(setup, state, history, contact, time, felt)
+    for k in range(3):
+        for j in range(3):
+            wanted[k] += c.force_scale * c.rotation[j, k] * felt[j]
+    safety.state_gate(enabled, wanted)
+    s.damping = 0.0
+    if enabled and contact != NONE:
+        s.damping = safety.control(s.energy, s.velocity, c.period, c.max_damping, wanted)
+    safety.settle(s.force, c.max_slew * elapsed, c.max_force, gain, wanted)
+    finite = np.isfinite(safety.norm(wanted))
+    for k in range(3):
+        s.force[k] = wanted[k] if finite else 0.0
+    if c.body_frame:
+        _rotate(s.orientation, s.force, -1.0, s.wrench)
+    else:
+        s.wrench[:] = s.force
+    return finite

@@ -1,0 +1,59 @@
+"""CRTK's operating state over ROS: topic, commands and query of one device or bridge."""
+
+from typing import Any
+
+from rclpy.node import Node
+
+from haptic_bridge.operating_state import OperatingStateMachine, crtk_types
+from tissue_sim.ros import EVENTS, LATCHED
+
+
+class StateInterface:
+    """Serves `<name>/operating_state` (topic and query) and `<name>/state_command`.
+
+    Args:
+        node: the node that the machine belongs to.
+        name: namespace, 'arm' or 'haptic_bridge'.
+        machine: shared with the loop of the node, which calls `publish_changes`.
+    """
+
+    def __init__(self, node: Node, name: str, machine: OperatingStateMachine) -> None:
+        types = crtk_types()
+        self._node = node
+        self._machine = machine
+        self._message = types.operating_state
+        self._published = -1
+        self._publisher = node.create_publisher(self._message, f'{name}/operating_state', LATCHED)
+        self._commands = node.create_subscription(
+            types.command, f'{name}/state_command', self._command, EVENTS
+        )
+        self._query = node.create_service(types.query, f'{name}/operating_state', self._answer)
+        self.publish_changes()
+
+    def publish_changes(self) -> None:
+        """Publishes the state if it has changed since; cheap enough for every tick of a loop."""
+        if self._published == self._machine.changes:
+            return
+        self._published = self._machine.changes
+        self._publisher.publish(self._current())
+        if self._machine.reason:
+            self._node.get_logger().error(f'FAULT: {self._machine.reason}')
+
+    def _command(self, message: Any) -> None:
+        refused = self._machine.command(message.string)
+        if refused:
+            self._node.get_logger().warning(refused)
+        self.publish_changes()
+
+    def _answer(self, _request: Any, response: Any) -> Any:
+        response.operating_state = self._current()
+        return response
+
+    def _current(self) -> Any:
+        message = self._message(
+            state=str(self._machine.state),
+            is_homed=self._machine.is_homed,
+            is_busy=self._machine.is_busy,
+        )
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        return message

@@ -1,0 +1,205 @@
+"""From the 30 Hz samples of the tissue's force to a force at any time between: thesis 6.3.
+
+A sample i is (t_i, P_i, F_i): at time t_i, at tool position P_i, the tissue pushed the tool with
+F_i. Times are those of the device poses that the simulation used, so the delay of the simulation is
+extrapolated over too.
+"""
+
+import numpy as np
+from numba import njit
+
+CONSTANT, TIME, POSITION, LOCAL_STIFFNESS = range(4)
+LAWS = {
+    'constant': CONSTANT,
+    'time': TIME,
+    'position': POSITION,
+    'local_stiffness': LOCAL_STIFFNESS,
+}
+
+FARTHEST = 3.0
+"""Intervals between samples that a line is followed: one to compute, one to wait, one lost."""
+SHORTEST = 5e-5
+"""[m] Below this distance of two samples their line is encoder noise: the force is held instead."""
+
+HISTORY = np.dtype(
+    [
+        ('count', 'i8'),  # samples that belong together: 0, 1 or 2; index 1 is the newest
+        ('time', 'i8', (2,)),  # [ns]
+        ('position', 'f8', (2, 3)),  # [m]
+        ('force', 'f8', (2, 3)),  # [N]
+        ('stiffness', 'f8', (3, 3)),  # [N/m] of the newest, -d(force)/d(position)
+        ('topology', 'i8'),
+        ('state', 'i8'),
+    ]
+)
+
+
+@njit(cache=True, nogil=True)
+def constant(force: np.ndarray, out: np.ndarray) -> None:
+    """F = F_i (eq. 6.3). Forces [N], shape (3,)."""
+    out[:] = force
+
+
+@njit(cache=True, nogil=True)
+def time_linear(time: int, times: np.ndarray, forces: np.ndarray, out: np.ndarray) -> None:
+    """F = F_i + (t - t_i) / (t_i - t_{i-1}) (F_i - F_{i-1}) (eq. 6.4).
+
+    Args:
+        time: t [ns].
+        times: t_{i-1}, t_i [ns], shape (2,).
+        forces: F_{i-1}, F_i [N], shape (2, 3).
+        out: F [N], shape (3,).
+    """
+    interval = times[1] - times[0]
+    s = 0.0
+    if interval > 0:
+        s = min(max((time - times[1]) / interval, 0.0), FARTHEST)
+    for k in range(3):
+        out[k] = forces[1, k] + s * (forces[1, k] - forces[0, k])
+
+
+@njit(cache=True, nogil=True)
+def position_linear(
+    position: np.ndarray,
+    positions: np.ndarray,
+    forces: np.ndarray,
+    max_stiffness: float,
+    out: np.ndarray,
+) -> None:
+    """F = F_i + s (F_i - F_{i-1}), s = (P - P_i).(P_i - P_{i-1}) / |P_i - P_{i-1}|^2.
+
+    Eq. 6.5 with the sign that the printed norms lose: a tool that turns back gets s < 0. Samples
+    closer than `SHORTEST` give no line; s is bounded by `FARTHEST`, the slope by what the device
+    renders.
+
+    Args:
+        position: P [m], shape (3,).
+        positions: P_{i-1}, P_i [m], shape (2, 3).
+        forces: F_{i-1}, F_i [N], shape (2, 3).
+        max_stiffness: largest |F_i - F_{i-1}| / |P_i - P_{i-1}| that is believed [N/m].
+        out: F [N], shape (3,).
+    """
+    squared = along = change = 0.0
+    for k in range(3):
+        d = positions[1, k] - positions[0, k]
+        squared += d * d
+        along += (position[k] - positions[1, k]) * d
+        change += (forces[1, k] - forces[0, k]) ** 2
+    s = 0.0
+    if squared >= SHORTEST * SHORTEST:
+        s = min(max(along / squared, -FARTHEST), FARTHEST)
+        steepest = max_stiffness * np.sqrt(squared)
+        change = np.sqrt(change)
+        if change > steepest:
+            s *= steepest / change
+    for k in range(3):
+        out[k] = forces[1, k] + s * (forces[1, k] - forces[0, k])
+
+
+@njit(cache=True, nogil=True)
+def local_stiffness(
+    position: np.ndarray,
+    at: np.ndarray,
+    force: np.ndarray,
+    stiffness: np.ndarray,
+    max_stiffness: float,
+    out: np.ndarray,
+) -> None:
+    """F = F_i - K (P - P_i), K scaled down where its Frobenius norm exceeds what the device
+    renders.
+
+    Args:
+        position: P [m], shape (3,).
+        at: P_i [m], shape (3,).
+        force: F_i [N], shape (3,).
+        stiffness: K [N/m], shape (3, 3).
+        max_stiffness: [N/m].
+        out: F [N], shape (3,).
+    """
+    norm = np.sqrt(np.sum(stiffness * stiffness))
+    scale = max_stiffness / norm if norm > max_stiffness else 1.0
+    for k in range(3):
+        pull = 0.0
+        for j in range(3):
+            pull += stiffness[k, j] * (position[j] - at[j])
+        out[k] = force[k] - scale * pull
+
+
+@njit(cache=True, nogil=True)
+def directional_stiffness(stiffness: np.ndarray, direction: np.ndarray) -> float:
+    """d.K.d / d.d [N/m]: what a spring K [N/m], shape (3, 3), resists along d, shape (3,)."""
+    squared = resisted = 0.0
+    for k in range(3):
+        squared += direction[k] * direction[k]
+        for j in range(3):
+            resisted += direction[k] * stiffness[k, j] * direction[j]
+    return resisted / squared if squared > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def estimate(
+    law: int,
+    history: np.ndarray,
+    time: int,
+    position: np.ndarray,
+    max_stiffness: float,
+    out: np.ndarray,
+) -> None:
+    """The force at (time, position) by one of `LAWS`; held where the history has a single sample.
+
+    Args:
+        law: CONSTANT, TIME, POSITION or LOCAL_STIFFNESS.
+        history: of at least one sample, dtype HISTORY, shape (1,).
+        time: [ns] of the device pose.
+        position: of the tool tip [m], shape (3,).
+        max_stiffness: [N/m].
+        out: [N], shape (3,).
+    """
+    h = history[0]
+    if law == LOCAL_STIFFNESS:
+        local_stiffness(position, h.position[1], h.force[1], h.stiffness, max_stiffness, out)
+    elif law == TIME and h.count == 2:
+        time_linear(time, h.time, h.force, out)
+    elif law == POSITION and h.count == 2:
+        position_linear(position, h.position, h.force, max_stiffness, out)
+    else:
+        constant(h.force[1], out)
+
+
+def clear(history: np.ndarray) -> None:
+    """Forgets the samples; the stiffness stays, as what is last known of this tissue."""
+    history['count'] = 0
+
+
+def push(
+    history: np.ndarray,
+    time: int,
+    position: np.ndarray,
+    force: np.ndarray,
+    stiffness: np.ndarray,
+    *,
+    topology: int,
+    state: int,
+) -> None:
+    """Adds a sample. A change of connectivity or of the contact's state makes older samples void.
+
+    Args:
+        history: dtype HISTORY, shape (1,), changed in place.
+        time: [ns].
+        position: [m], shape (3,).
+        force: [N], shape (3,).
+        stiffness: [N/m], shape (3, 3); all zero where the simulation has none: the last known one
+            is kept.
+        topology: connectivity count of the mesh that the sample stems from.
+        state: contact state that it stems from.
+    """
+    h = history[0]
+    same = h['topology'] == topology and h['state'] == state
+    h['count'] = min(h['count'] + 1, 2) if same else 1
+    for name, value in (('time', time), ('position', position), ('force', force)):
+        h[name][0] = h[name][1]
+        h[name][1] = value
+    if np.any(stiffness):
+        h['stiffness'] = stiffness
+    h['topology'] = topology
+    h['state'] = state

@@ -1,0 +1,366 @@
+"""One tick of the force loop, from the device's pose to the force on the operator's hand, without
+ROS.
+
+The thesis (ch. 6.2) separates two forces, and so does this: what the proxy's spring exerts loads
+the tissue (`Contact.external_force`); what the tissue answers, extrapolated, is what the hand
+feels.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from haptic_bridge import chain, extrapolation, safety
+from haptic_bridge.chain import INSIDE, NONE, TOUCHING
+from haptic_bridge.operating_state import State
+from haptic_bridge.proxy import Proxy
+from haptic_bridge.settings import (
+    DeviceProfile,
+    DeviceSettings,
+    HapticsSettings,
+    ToolSettings,
+    check_together,
+)
+from haptic_bridge.surface import Surface
+from haptic_bridge.wire import ForceSampleCodec, Sample
+
+_SECOND = 1e-9
+_LONGEST_STEP = 0.005
+"""[s] of slew that a late tick may catch up on."""
+_FRAME_RANGE = (0.01, 0.05)
+"""[s] between the surfaces that a blend is spread over; frames outside are late, not slow."""
+_UNNOTICED_NS = 3_000_000
+"""[ns] that a sample may lie unread: its age counts from before that, so that deadlines hold."""
+_NOWHERE = ((0,) * 9, (0.0,) * 9, (0.0,) * 3, (0.0,) * 3)
+
+
+class Tick(NamedTuple):
+    """What one tick commands.
+
+    Attributes:
+        wrench: force [N] and torque [N m] on the hand, as `WrenchStampedCodec` takes them.
+        contact: as `ContactCodec` takes it.
+        contact_stamp_ns: stamp of the device pose that the contact stems from.
+        fault: why force is impossible, '' when nothing is wrong. Whoever calls must enter FAULT.
+    """
+
+    wrench: tuple[float, ...]
+    contact: tuple[float, ...]
+    contact_stamp_ns: int
+    fault: str
+
+
+class ForcePath:
+    """Proxy, extrapolation and safety chain in the order of one tick.
+
+    Time comes from outside, so that a recorded session gives the same forces again. Ages are
+    measured between arrivals on the caller's clock; stamps are compared with stamps of the same
+    sender only.
+
+    Args:
+        tool, device, haptics: sections of the scene.
+        profile: limits of the device.
+
+    Attributes:
+        stale_trips: how often the simulation's data went stale while enabled.
+        rejected: messages that were refused: repeated, out of order, marked invalid.
+        contact_time: total [s].
+        max_force: largest norm commanded [N].
+
+    Raises:
+        SettingsError: settings that do not fit together.
+    """
+
+    def __init__(
+        self,
+        tool: ToolSettings,
+        device: DeviceSettings,
+        haptics: HapticsSettings,
+        profile: DeviceProfile,
+    ) -> None:
+        check_together(tool, device, haptics, profile)
+        self.haptics = haptics
+        self.stale_trips = 0
+        self.rejected = 0
+        self.contact_time = 0.0
+        self.max_force = 0.0
+        self._setup = chain.make_setup(tool, device, haptics, profile)
+        self._state = np.zeros(1, chain.STATE)
+        self._s: Any = self._state[0]
+        self._history = np.zeros(1, extrapolation.HISTORY)
+        self._proxy = Proxy(tool.radius)
+        self._tail = (tool.coupling_stiffness, tool.radius)
+        self._pose = np.zeros(7)
+        self._pose_stamp = self._pose_ns = 0
+        self._sample_ns = self._current_ns = self._start_ns = self._last_ns = 0
+        self._step = self._sample_revision = -1
+        self._sample_state = NONE
+        self._surface: Surface | None = None
+        self._surface_ns = 0
+        self._frame = _FRAME_RANGE[1]
+        self._sequence = self._began = 0
+        self._contact = NONE
+        self._was_enabled = self._stale = False
+
+    @property
+    def force_norm(self) -> float:
+        """Norm of the commanded force [N]."""
+        return float(np.linalg.norm(self._s['force']))
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the simulation is silent while force is wanted."""
+        return self._stale
+
+    @property
+    def contact(self) -> int:
+        """NONE, TOUCHING or INSIDE."""
+        return self._contact
+
+    @property
+    def energy(self) -> float:
+        """What the hand has put in, net [J]; negative: the force loop has made energy."""
+        return float(self._s['energy'])
+
+    @property
+    def damping(self) -> float:
+        """Of the passivity controller now [N s/m]."""
+        return float(self._s['damping'])
+
+    def pose_age(self, now_ns: int) -> float:
+        """Since the last believable device pose [s]; infinite before the first."""
+        return (now_ns - self._pose_ns) * _SECOND if self._pose_ns else np.inf
+
+    def simulation_age(self, now_ns: int) -> float:
+        """Since the last force and surface of the simulation [s]; infinite before the first."""
+        oldest = min(self._sample_ns, self._current_ns)
+        return (now_ns - oldest) * _SECOND if oldest else np.inf
+
+    def cause(self, now_ns: int) -> str:
+        """Why the device cannot be given force now; '' when nothing is wrong."""
+        if self.pose_age(now_ns) > self.haptics.device_timeout:
+            return f'no valid device pose for {self.haptics.device_timeout * 1e3:g} ms'
+        return ''
+
+    def is_fresh(self, now_ns: int) -> bool:
+        """Whether device, force and surface have all arrived lately."""
+        return not self.cause(now_ns) and self.simulation_age(now_ns) <= self.haptics.stale_after
+
+    def tick(
+        self,
+        now_ns: int,
+        *,
+        state: State,
+        pose: Sample | None = None,
+        sample: Sample | None = None,
+        surface: Surface | None = None,
+    ) -> Tick:
+        """One period.
+
+        Args:
+            now_ns: monotonic clock [ns].
+            state: operating state; force only when ENABLED, zero at once when FAULT.
+            pose: `measured_cp` where one has arrived since the last tick.
+            sample: `ForceSample` where one has arrived since the last tick.
+            surface: the newest surface of the tissue; None before the first.
+        """
+        elapsed = min(max((now_ns - self._last_ns) * _SECOND, 1e-4), _LONGEST_STEP)
+        self._last_ns = now_ns
+        enabled = state is State.ENABLED
+        fault = self._take_pose(now_ns, pose, enabled) or self._take_sample(now_ns, sample)
+        fault = fault or self.cause(now_ns)
+        enabled, fault = enabled and not fault, fault if enabled else ''
+        if enabled and not self._was_enabled:
+            self._begin(now_ns)
+        self._was_enabled = enabled
+        gain = self._gain(now_ns, enabled)
+        touched = self._touch(now_ns, surface, enabled)
+        if fault or state is State.FAULT:
+            self._s['force'] = 0.0
+        if not chain.command(
+            self._setup,
+            self._state,
+            self._history,
+            self._contact,
+            enabled,
+            self._pose_stamp,
+            gain,
+            elapsed,
+        ):
+            fault = fault or 'the commanded force was not finite'
+        if self._contact != NONE:
+            self.contact_time += elapsed
+        self.max_force = max(self.max_force, self.force_norm)
+        wrench = (*self._s['wrench'].tolist(), 0.0, 0.0, 0.0)
+        return Tick(wrench, self._contact_values(surface, touched), self._pose_stamp, fault)
+
+    def _take_pose(self, now_ns: int, pose: Sample | None, enabled: bool) -> str:
+        if pose is None:
+            return ''
+        # After a silence without force anything is a new start: a device may have another clock.
+        known = enabled or self.pose_age(now_ns) <= self.haptics.device_timeout
+        if pose.stamp_ns == 0 or (known and pose.stamp_ns <= self._pose_stamp):
+            self.rejected += 1
+            return ''
+        known = known and enabled
+        elapsed = (pose.stamp_ns - self._pose_stamp) * _SECOND if known else np.inf
+        self._pose[:] = pose.values
+        code = safety.pose_gate(self._pose[:3], self._pose[3:], self._s['device'], elapsed)
+        if code != safety.OK:
+            self.rejected += 1
+            return safety.POSE_FAULTS[code]
+        chain.to_tissue(self._setup, self._state, self._pose)
+        if not known:
+            self._s['moved'] = 0.0
+        self._pose_stamp, self._pose_ns = pose.stamp_ns, now_ns
+        return ''
+
+    def _take_sample(self, now_ns: int, sample: Sample | None) -> str:
+        if sample is None:
+            return ''
+        get, values = ForceSampleCodec.fields, sample.values
+        step = int(values[0])
+        fresh = (now_ns - self._sample_ns) * _SECOND <= self.haptics.stale_after
+        if sample.stamp_ns == 0 or (fresh and step <= self._step):
+            self.rejected += 1
+            return ''
+        force = np.array(values[get['force']])
+        stiffness = np.array(values[get['stiffness']]).reshape(3, 3)
+        position = np.array(values[get['position']])
+        if not (safety.force_gate(force, stiffness) and np.isfinite(position).all()):
+            self.rejected += 1
+            extrapolation.clear(self._history)
+            limit = f'{safety.LARGEST_FORCE:g} N'
+            return f'the tissue force of frame {step} is not finite or above {limit}'
+        if not fresh:
+            extrapolation.clear(self._history)
+        self._step, self._sample_revision = step, int(values[1])
+        self._sample_ns = now_ns - _UNNOTICED_NS
+        self._sample_state = int(values[get['state']][0])
+        self._s['resistance'] = values[get['resistance']][0]
+        answered = self._began <= int(values[3]) <= self._sequence and self._contact == TOUCHING
+        if self._sample_state == INSIDE or answered:
+            time = int(values[4]) * 1_000_000_000 + int(values[5])
+            extrapolation.push(
+                self._history,
+                time,
+                position,
+                force,
+                stiffness,
+                topology=int(values[2]),
+                state=self._sample_state,
+            )
+        return ''
+
+    def _begin(self, now_ns: int) -> None:
+        self._start_ns = now_ns
+        self._stale = False
+        self._s['energy'] = 0.0
+        self._s['velocity'] = 0.0
+        self._leave_contact()
+
+    def _leave_contact(self) -> None:
+        self._proxy.reset()
+        self._contact = NONE
+        extrapolation.clear(self._history)
+
+    def _gain(self, now_ns: int, enabled: bool) -> float:
+        age = self.simulation_age(now_ns)
+        stale = enabled and age > self.haptics.stale_after
+        if stale and not self._stale:
+            self.stale_trips += self._sample_ns > 0
+        elif self._stale and not stale:
+            self._start_ns = now_ns
+        self._stale = stale
+        since = (now_ns - self._start_ns) * _SECOND
+        return safety.soft_start(since, self.haptics.soft_start) * safety.freshness(
+            age, self.haptics.stale_after, self.haptics.fade
+        )
+
+    def _touch(self, now_ns: int, surface: Surface | None, enabled: bool) -> Any:
+        """Moves the proxy; returns its contact where it touches, else None."""
+        self._sequence += 1
+        self._follow(now_ns, surface)
+        before = self._contact
+        inside = self._sample_state == INSIDE
+        if enabled and inside:
+            # The samples of the cut stay: the change of state has already voided the older ones.
+            if before != INSIDE:
+                self._proxy.reset()
+            self._contact = INSIDE
+            self._s['proxy'] = self._s['tip']
+            return None
+        if before == INSIDE or (before == TOUCHING and not enabled):
+            self._leave_contact()
+            self._start_ns = now_ns
+        if not enabled or surface is None:
+            self._s['proxy'] = self._s['tip']
+            return None
+        touched = self._proxy.step(surface, self._blend(now_ns), self._s['tip'])
+        self._s['proxy'] = touched.position
+        self._contact = TOUCHING if touched.touching else NONE
+        if self._contact != before:
+            extrapolation.clear(self._history)
+        if not touched.touching:
+            return None
+        if before != TOUCHING:
+            self._began = self._sequence
+            # What the last contact dissipated is no credit for this one.
+            self._s['energy'] = min(self._s['energy'], 0.0)
+        self._s['normal'] = touched.normal
+        return touched
+
+    def _follow(self, now_ns: int, surface: Surface | None) -> None:
+        if surface is None:
+            return
+        if surface is not self._surface:
+            shortest, longest = _FRAME_RANGE
+            self._frame = min(max((now_ns - self._surface_ns) * _SECOND, shortest), longest)
+            self._surface, self._surface_ns = surface, now_ns
+        if surface.revision >= self._sample_revision:
+            self._current_ns = now_ns
+
+    def _blend(self, now_ns: int) -> float:
+        return min((now_ns - self._surface_ns) * _SECOND / self._frame, 1.0)
+
+    def _contact_values(self, surface: Surface | None, touched: Any) -> tuple[float, ...]:
+        s = self._s
+        revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
+        nodes, weights, point, normal = _NOWHERE
+        if touched is not None:
+            nodes, weights = touched.nodes.tolist(), touched.weights.tolist()
+            point, normal = touched.contact.tolist(), s['normal'].tolist()
+        return (
+            self._sequence,
+            self._contact,
+            revision,
+            topology,
+            *nodes,
+            *weights,
+            *s['tip'].tolist(),
+            *s['proxy'].tolist(),
+            *point,
+            *normal,
+            *s['external'].tolist(),
+            self._tail[0],
+            *s['blade'].ravel().tolist(),
+            self._tail[1],
+        )
+
+
+def warm_up(
+    tool: ToolSettings, device: DeviceSettings, haptics: HapticsSettings, profile: DeviceProfile
+) -> None:
+    """Compiles, or loads from the cache, everything that a tick calls."""
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+    triangle = np.array([[0, 1, 2]], np.int32)
+    surface = Surface(corners, triangle, revision=0, topology=0)
+    path = ForcePath(tool, device, haptics, profile)
+    for i, height in enumerate((2.0, 0.5, -0.001, -0.001, -0.001)):
+        tip = device.tissue_from_device.to_device(np.array([0.0, 0.0, height * tool.radius]))
+        stamp = (i + 1) * 1_000_000
+        pose = Sample(stamp, '', (*tip.tolist(), 0.0, 0.0, 0.0, 1.0))
+        sample = Sample(stamp, '', (i, i, 0, i, 0, stamp, TOUCHING) + (1e-3,) * 18)
+        path.tick(stamp, state=State.ENABLED, pose=pose, sample=sample, surface=surface)
+        surface = Surface(corners, triangle, revision=i + 1, topology=0, previous=surface)
+        corners = corners + 1e-5

@@ -1,0 +1,199 @@
+"""The operator's hand: a scripted target, tremor, and the spring that pulls the tool there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.spatial.transform import Rotation
+
+from haptic_bridge.arm_settings import HandSettings, Phase, PoseSettings, ScriptSettings
+from haptic_bridge.settings import SettingsError, Transform
+
+_FASTEST = 2.0
+_TREMOR_BAND = (8.0, 12.0)
+_TREMOR_TONES = 5
+_PEAK_OF_MINIMUM_JERK = 1.875
+
+
+@dataclass(frozen=True)
+class HandScript:
+    """Poses in the device frame, moved between with minimum jerk, at rest in each of them.
+
+    Attributes:
+        times: [s] when each pose is reached, ascending from 0, shape (n,).
+        positions: [m], shape (n, 3).
+        orientations: quaternions x y z w, signs continuous, shape (n, 4).
+        phase_ends: [s] by phase, shape (p,).
+        phases: name and kind by phase.
+    """
+
+    times: np.ndarray
+    positions: np.ndarray
+    orientations: np.ndarray
+    phase_ends: np.ndarray
+    phases: tuple[tuple[str, str], ...]
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return float(self.times[-1])
+
+    def phase_at(self, time: float) -> tuple[str, str]:
+        """Name and kind of the phase at a time [s]; the last one after the end."""
+        index = int(np.searchsorted(self.phase_ends, time, side='right'))
+        return self.phases[min(index, len(self.phases) - 1)]
+
+
+def compile_script(
+    settings: ScriptSettings, tissue_from_device: Transform, seconds: float = 0.0
+) -> HandScript:
+    """Lays a script out in time and in the device frame.
+
+    Args:
+        settings: the script, in the tissue frame.
+        tissue_from_device: how the device stands to the tissue.
+        seconds: [s] duration instead of the script's own; 0 keeps that.
+
+    Raises:
+        SettingsError: the hand would have to move faster than a hand can.
+    """
+    durations, poses, ends = [0.0], [settings.start], []
+    total = sum(phase.share for phase in settings.phases)
+    for phase in settings.phases:
+        length = (seconds or settings.seconds) * phase.share / total
+        route = _route(phase, poses[-1])
+        shares = sum(share for share, _ in route)
+        durations += [length * share / shares for share, _ in route]
+        poses += [pose for _, pose in route]
+        ends.append(length)
+    positions = tissue_from_device.to_device(np.array([pose.position for pose in poses]))
+    _check_speed(np.array(durations[1:]), positions)
+    return HandScript(
+        times=np.cumsum(durations),
+        positions=positions,
+        orientations=_orientations(poses, tissue_from_device),
+        phase_ends=np.cumsum(ends),
+        phases=tuple((phase.name or phase.kind, phase.kind) for phase in settings.phases),
+    )
+
+
+def _route(phase: Phase, here: PoseSettings) -> Sequence[tuple[float, PoseSettings]]:
+    if not phase.waypoints:
+        return [(1.0, PoseSettings(position=here.position))]
+    return [(point.share, point) for point in phase.waypoints] * phase.repeat
+
+
+def _check_speed(durations: np.ndarray, positions: np.ndarray) -> None:
+    speeds = _PEAK_OF_MINIMUM_JERK * np.linalg.norm(np.diff(positions, axis=0), axis=1) / durations
+    worst = int(np.argmax(speeds))
+    if speeds[worst] > _FASTEST:
+        raise SettingsError(
+            f'arm.script: move {worst + 1} peaks at {speeds[worst]:.3g} m/s, but a hand reaches '
+            f'{_FASTEST:g} m/s: give it {speeds[worst] / _FASTEST:.3g} times its '
+            f'{durations[worst]:.3g} s'
+        )
+
+
+def _orientations(poses: list[PoseSettings], tissue_from_device: Transform) -> np.ndarray:
+    to_device = Rotation.from_matrix(tissue_from_device.rotation()).inv()
+    current = Rotation.identity()
+    quaternions = np.empty((len(poses), 4))
+    for i, pose in enumerate(poses):
+        if pose.quaternion is not None:
+            current = Rotation.from_quat(pose.quaternion)
+        elif pose.rpy_deg is not None:
+            current = Rotation.from_euler('xyz', pose.rpy_deg, degrees=True)
+        quaternions[i] = (to_device * current).as_quat()
+        if i and quaternions[i] @ quaternions[i - 1] < 0:
+            quaternions[i] *= -1
+    return quaternions
+
+
+class Hand:
+    """Where the hand wants the tool, and how firmly it holds it.
+
+    Args:
+        settings: stiffness, damping, tremor.
+        script: what it does.
+        seed: of the tremor.
+
+    Attributes:
+        position, velocity: of the target [m], [m/s], shape (3,).
+        orientation: of the tool, quaternion x y z w, shape (4,).
+    """
+
+    def __init__(self, settings: HandSettings, script: HandScript, seed: int = 0) -> None:
+        self.script = script
+        self.stiffness = settings.stiffness
+        self.damping = settings.damping
+        self.position = np.empty(3)
+        self.velocity = np.empty(3)
+        self.orientation = np.empty(4)
+        random = np.random.default_rng(seed)
+        shape = (3, _TREMOR_TONES)
+        self._tremor = settings.tremor * np.sqrt(2 / _TREMOR_TONES)
+        self._tones = 2 * np.pi * random.uniform(*_TREMOR_BAND, shape)
+        self._angles = random.uniform(0, 2 * np.pi, shape)
+        self.move_to(0.0, 0.0)
+
+    def move_to(self, time: float, tremor_time: float) -> None:
+        """Sets the target.
+
+        Args:
+            time: [s] in the script; 0 is its start, and after its end it stays.
+            tremor_time: [s]; tremor goes on while the script waits.
+        """
+        script = self.script
+        _follow(
+            time,
+            (script.times, script.positions, script.orientations),
+            (self.position, self.velocity, self.orientation),
+        )
+        if self._tremor > 0:
+            _tremble(
+                tremor_time, self._tremor, self._tones, self._angles, self.position, self.velocity
+            )
+
+
+@njit(cache=True)
+def _follow(time, script, target):
+    times, positions, orientations = script
+    position, velocity, orientation = target
+    if time <= times[0] or time >= times[-1]:
+        end = 0 if time <= times[0] else len(times) - 1
+        position[:] = positions[end]
+        velocity[:] = 0.0
+        orientation[:] = orientations[end]
+        return
+    i = np.searchsorted(times, time, side='right') - 1
+    length = times[i + 1] - times[i]
+    s = (time - times[i]) / length
+    part = s * s * s * (10 - 15 * s + 6 * s * s)
+    rate = 30 * s * s * (1 - s) * (1 - s) / length
+    dot = 0.0
+    for axis in range(3):
+        way = positions[i + 1, axis] - positions[i, axis]
+        position[axis] = positions[i, axis] + part * way
+        velocity[axis] = rate * way
+    for k in range(4):
+        dot += orientations[i, k] * orientations[i + 1, k]
+    angle = np.arccos(min(dot, 1.0))
+    before, after = 1 - part, part
+    if angle > 1e-6:
+        before, after = (
+            np.sin((1 - part) * angle) / np.sin(angle),
+            np.sin(part * angle) / np.sin(angle),
+        )
+    for k in range(4):
+        orientation[k] = before * orientations[i, k] + after * orientations[i + 1, k]
+
+
+@njit(cache=True)
+def _tremble(time, amplitude, tones, angles, position, velocity):
+    for axis in range(3):
+        for tone in range(tones.shape[1]):
+            omega = tones[axis, tone]
+            angle = omega * time + angles[axis, tone]
+            position[axis] += amplitude * np.sin(angle)
+            velocity[axis] += amplitude * omega * np.cos(angle)

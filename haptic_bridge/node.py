@@ -1,0 +1,260 @@
+"""Node `haptic_bridge`: poses in, forces out, a thousand times a second."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from cutting_trainer_msgs.msg import Contact, ForceSample, Mesh, MeshDelta
+from cutting_trainer_msgs.srv import GetMesh
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.duration import Duration
+from rclpy.node import Node
+
+from haptic_bridge.crtk import StateInterface
+from haptic_bridge.force_path import ForcePath, warm_up
+from haptic_bridge.operating_state import OperatingStateMachine, State
+from haptic_bridge.realtime import prepare, run_real_time
+from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from haptic_bridge.surface import Surface
+from haptic_bridge.wire import (
+    ContactCodec,
+    ForceSampleCodec,
+    PoseStampedCodec,
+    Sample,
+    WrenchStampedCodec,
+)
+from tissue_sim import ros
+from tissue_sim.replica import MeshReplica
+from tissue_sim.scene_file import read_section
+from tissue_sim.timing import PeriodicLoop
+
+FOLLOW_PERIOD = 0.0015
+"""[s] between two looks for frames of the simulation."""
+STATE_PERIOD = 0.02
+"""[s] between two looks for changes of the operating state."""
+ANSWER_TIMEOUT = 1.0
+"""[s] after which a question for the full mesh is asked again."""
+
+
+class SimulationFollower:
+    """Keeps up with the simulation in a thread of its own, so that decoding a mesh delays no force.
+
+    Args:
+        node: to subscribe with.
+        on_error: told, as a sentence, what message could not be used.
+
+    Attributes:
+        surface: the newest whole one; None before the first.
+        samples: forces that the fast loop has not taken yet.
+        gaps: how often a revision was missed.
+    """
+
+    def __init__(self, node: Node, on_error: Callable[[str], None]) -> None:
+        self.surface: Surface | None = None
+        self.samples: deque[Sample] = deque(maxlen=4)
+        self.gaps = 0
+        self._on_error = on_error
+        self._replica = MeshReplica()
+        self._stamp = (0, 0)
+        self._codec = ForceSampleCodec()
+        self._mesh = ros.polled(node, Mesh, ros.MESH, ros.LATCHED)
+        self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
+        self._force = ros.polled(node, ForceSample, ros.FORCE, ros.STREAM)
+        self._client = node.create_client(GetMesh, ros.GET_MESH)
+        self._answers: deque[Mesh] = deque(maxlen=2)
+        self._asked = 0.0
+
+    def run(self, stop: ros.Stop) -> None:
+        """Follows until `stop` is set."""
+        while not stop.is_set():
+            try:
+                self.poll()
+            except Exception as error:
+                self._on_error(f'message of the simulation: {error}')
+                self._ask()
+            time.sleep(FOLLOW_PERIOD)
+
+    def poll(self) -> None:
+        """Takes what has arrived."""
+        known = self._replica.revision, self._replica.topology
+        while (mesh := ros.take(self._mesh)) is not None:
+            self._load(mesh)
+        while self._answers:
+            self._load(self._answers.popleft())
+        while (delta := ros.take(self._updates)) is not None:
+            self._apply(delta)
+        if (self._replica.revision, self._replica.topology) != known:
+            self._renew()
+        raw = ros.take_raw(self._force)
+        if raw is not None:
+            self.samples.append(self._codec.decode(raw))
+
+    def _load(self, mesh: Mesh) -> None:
+        # A keyframe can arrive after the deltas that follow it; an older revision of a younger
+        # stamp is a simulation that has started again.
+        stamp = (mesh.header.stamp.sec, mesh.header.stamp.nanosec)
+        if mesh.revision > self._replica.revision or stamp > self._stamp:
+            self._replica.load(mesh)
+            self._stamp = stamp
+
+    def _apply(self, delta: MeshDelta) -> None:
+        if self._replica.apply(delta):
+            stamp = (delta.header.stamp.sec, delta.header.stamp.nanosec)
+            self._stamp = max(self._stamp, stamp)
+        elif self._replica.revision >= 0:
+            self._ask()
+
+    def _ask(self) -> None:
+        now = time.monotonic()
+        if now - self._asked < ANSWER_TIMEOUT or not self._client.service_is_ready():
+            return
+        self._asked = now
+        self.gaps += 1
+        self._client.call_async(GetMesh.Request()).add_done_callback(self._answered)
+
+    def _answered(self, future: Any) -> None:
+        response = future.result()
+        if response is not None and response.success:
+            self._answers.append(response.mesh)
+            self._asked = 0.0
+
+    def _renew(self) -> None:
+        replica = self._replica
+        self.surface = Surface(
+            replica.positions(),
+            replica.triangles,
+            revision=replica.revision,
+            topology=replica.topology,
+            previous=self.surface,
+        )
+
+
+class HapticBridge(Node):
+    """The shell of `ForcePath`.
+
+    Parameters:
+        scene: path of the scene file.
+        auto_enable: enter ENABLED when device, force and surface are fresh for the first time.
+        Never again after
+            that: a FAULT is left by a command only.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('haptic_bridge')
+        scene = Path(self.declare_parameter('scene', '').value)
+        self._auto_enable = bool(self.declare_parameter('auto_enable', False).value)
+        device = read_section(scene, 'device', DeviceSettings)
+        tool = read_section(scene, 'tool', ToolSettings)
+        haptics = read_section(scene, 'haptics', HapticsSettings)
+        profile = device.load_profile()
+        warm_up(tool, device, haptics, profile)
+        self._path = ForcePath(tool, device, haptics, profile)
+        self._machine = OperatingStateMachine(lambda: self._path.cause(time.monotonic_ns()))
+        self._loop = PeriodicLoop(haptics.rate)
+        self._real_time = 'the force loop has not started'
+        self._faults, self._last_fault, self._was_faulty = 0, '', False
+        self._pose_codec = PoseStampedCodec()
+        self._wrench_codec = WrenchStampedCodec(f'{ros.ARM}_base')
+        self._contact_codec = ContactCodec(ros.FRAME)
+        self._pose = ros.polled(self, PoseStamped, f'{ros.ARM}/measured_cp', ros.NEWEST_BEST_EFFORT)
+        self._wrench = self.create_publisher(WrenchStamped, f'{ros.ARM}/servo_cf', ros.STREAM)
+        self._contact = self.create_publisher(Contact, ros.CONTACT, ros.STREAM)
+        self._follower = SimulationFollower(self, self._machine.fault)
+        self._interface = StateInterface(self, 'haptic_bridge', self._machine)
+        self._diagnostics = ros.Diagnostics(self, self._collect)
+        self._states = self.create_timer(STATE_PERIOD, self._watch_state)
+
+    def work(self, stop: ros.Stop) -> None:
+        """Runs the force loop in the calling thread until `stop` is set."""
+        follower = threading.Thread(target=self._follower.run, args=(stop,), daemon=True)
+        follower.start()
+        ros.announce_ready(self)
+        self._real_time = prepare()
+        self.get_logger().info(self._real_time)
+        run_real_time(self._loop, self._tick, stop)
+        follower.join(1.0)
+
+    def close(self) -> None:
+        """Leaves no force behind."""
+        self._send((0.0,) * 6)
+        self._wrench.wait_for_all_acked(Duration(seconds=0.2))
+        self._diagnostics.publish()
+
+    def _tick(self, _late: int) -> None:
+        try:
+            raw = ros.take_raw(self._pose)
+            samples = self._follower.samples
+            tick = self._path.tick(
+                time.monotonic_ns(),
+                state=self._machine.state,
+                pose=None if raw is None else self._pose_codec.decode(raw),
+                sample=samples.popleft() if samples else None,
+                surface=self._follower.surface,
+            )
+            self._send(tick.wrench)
+            if tick.fault:
+                self._machine.fault(tick.fault)
+            contact = self._contact_codec.encode(tick.contact_stamp_ns, tick.contact)
+            self._contact.publish(contact)
+        except Exception as error:
+            self._machine.fault(f'the force loop failed: {type(error).__name__}: {error}')
+            self._send((0.0,) * 6)
+
+    def _send(self, wrench: tuple[float, ...]) -> None:
+        self._wrench.publish(self._wrench_codec.encode(time.time_ns(), wrench))
+
+    def _watch_state(self) -> None:
+        if self._auto_enable and self._path.is_fresh(time.monotonic_ns()):
+            self._auto_enable = False
+            self._machine.command('enable')
+        reason = self._machine.reason
+        if reason and not self._was_faulty:
+            self._faults += 1
+            self._last_fault = reason
+        self._was_faulty = bool(reason)
+        self._interface.publish_changes()
+
+    def _collect(self) -> tuple[bytes, str, dict[str, object]]:
+        now = time.monotonic_ns()
+        path, machine, report = self._path, self._machine, self._loop.report()
+        surface = self._follower.surface
+        values: dict[str, object] = {
+            'operating_state': machine.state,
+            'fault': machine.reason,
+            'faults': self._faults,
+            'last_fault': self._last_fault,
+            'contact': path.contact,
+            'contact_time': path.contact_time,
+            'force_norm': path.force_norm,
+            'max_force': path.max_force,
+            'pose_age': path.pose_age(now),
+            'simulation_age': path.simulation_age(now),
+            'stale_trips': path.stale_trips,
+            'rejected': path.rejected,
+            'energy': path.energy,
+            'damping': path.damping,
+            'revision': surface.revision if surface is not None else -1,
+            'revision_gaps': self._follower.gaps,
+            'tick_us_p50': report.get('busy_p50', 0.0) * 1e6,
+            'tick_us_p99': report.get('busy_p99', 0.0) * 1e6,
+            'real_time': self._real_time,
+            **report,
+        }
+        if machine.state is State.FAULT:
+            return DiagnosticStatus.ERROR, machine.reason, values
+        if machine.state is State.ENABLED and path.is_stale:
+            return DiagnosticStatus.WARN, 'the simulation is silent: no force', values
+        return DiagnosticStatus.OK, str(machine.state), values
+
+
+def main() -> None:
+    """Runs the node."""
+    ros.run(HapticBridge, HapticBridge.work)
+
+
+if __name__ == '__main__':
+    main()
