@@ -1,0 +1,290 @@
+"""One atomic batch: crossings that the blade has left become a change of connectivity
+(docs/cutting.md).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from cutting.cases import NAMES
+from cutting.fragments import small_pieces
+from cutting.lookup import BLOCKED, DONE, EDGES, PENDING, Tables, edge_key, find_edge, with_room
+from cutting.method import CASES, Report
+from cutting.snapping import slides
+from cutting.stars import Patch, cut_area, lay_patch, nodes_concerned, split_stars
+from cutting.state_table import (
+    adopt,
+    block,
+    non_active_crossings,
+    outer_bits_of,
+    parents_concerned,
+    ring_members,
+    settle,
+    settle_nodes,
+)
+from cutting.subdivision import Pieces, spoiled, subdivide
+from tissue_sim.mesh import TetMesh, TopologyDelta
+
+_CASE_OF_STATE = np.array([CASES.index(name) for name in NAMES])
+_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+class CutStateError(ValueError):
+    """A state that no table knows; nothing has been changed in the mesh."""
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """What tells the methods of the family apart.
+
+    Attributes:
+        tau: a crossing nearer to a node than this share of its edge goes to the node.
+        floor: smallest altitude of a new element, as a share of the median altitude at the start.
+        true_points: new nodes at the true crossings, else at midpoints and centroids.
+        slides: snapped nodes move onto the swept surface.
+        subdivides: whether elements are divided at all.
+        least_share: new nodes keep away from the ends of an edge by this share.
+    """
+
+    tau: float = 0.3
+    floor: float = 0.02
+    true_points: bool = True
+    slides: bool = True
+    subdivides: bool = True
+    least_share: float = 0.1
+
+
+class Batch(NamedTuple):
+    """A change of connectivity, not yet applied, with the tables, nodes and tetrahedra that
+    there are once it is.
+    """
+
+    tables: Tables
+    delta: TopologyDelta
+    report: Report
+    size: tuple[int, int]
+
+
+class _Moves(NamedTuple):
+    """Snapped nodes that slide: rows in the look-up table, shape (j,), and rest positions [m],
+    (j, 3).
+    """
+
+    rows: np.ndarray
+    where: np.ndarray
+
+
+def build_batch(
+    mesh: TetMesh,
+    positions: np.ndarray,
+    tables: Tables,
+    active: np.ndarray,
+    scheme: Scheme,
+    floor: float,
+) -> Batch:
+    """Makes the batch of all crossings that the blade has left.
+
+    Args:
+        mesh: the tissue.
+        positions: current nodes [m], shape (n, 3).
+        tables: of the stroke; they follow as if the batch were applied.
+        active: nodes of the tetrahedra that the blade is in, shape (a, 4).
+        scheme: of the method.
+        floor: altitude that no new element falls below [m].
+
+    Raises:
+        CutStateError: an element is in a state that no table knows, or would be turned over.
+    """
+    links = mesh.links
+    edges, nodes = non_active_crossings(active, tables)
+    if not len(edges) and not len(nodes):
+        size = (mesh.node_count, len(mesh.tetrahedra))
+        return Batch(tables, TopologyDelta(), Report(), size)
+    _place(tables, edges, scheme)
+    members = ring_members(links, tables, edges)
+    m = len(mesh.tetrahedra)
+    tables = with_room(
+        tables, mesh_nodes=mesh.node_count, tetrahedra=m, nodes=0, edges=0, parents=len(members)
+    )
+    adopt(links, tables, members)
+    parents = parents_concerned(links, tables, edges, nodes)
+    moves = _Moves(np.zeros(0, np.int64), np.zeros((0, 3)))
+    if scheme.slides:
+        moves = _Moves(*slides(nodes, links, tables, mesh.rest, floor))
+    pieces, moves, worst = _sound_pieces(
+        mesh, positions, tables, parents, edges, moves, scheme, floor
+    )
+    return _assemble(mesh, positions, tables, edges, nodes, parents, pieces, moves, worst)
+
+
+def _place(tables: Tables, edges: np.ndarray, scheme: Scheme) -> None:
+    """Puts the new nodes of edges at their crossings, or at midpoints."""
+    share = tables.edge_share[edges]
+    least = scheme.least_share
+    tables.edge_share[edges] = np.clip(share, least, 1 - least) if scheme.true_points else 0.5
+
+
+def _sound_pieces(
+    mesh: TetMesh,
+    positions: np.ndarray,
+    tables: Tables,
+    parents: np.ndarray,
+    edges: np.ndarray,
+    moves: _Moves,
+    scheme: Scheme,
+    floor: float,
+) -> tuple[Pieces, _Moves, float]:
+    """Divides the parents; where that falls below the floor, at midpoints, and if need be not at
+    all.
+    """
+    front = scheme.tau if scheme.true_points else 0.5
+    plain = np.zeros(0, np.int64)
+    for attempt in range(len(edges) + 2):
+        pieces, unknown = subdivide(parents, mesh.links, tables, positions, mesh.rest, front, plain)
+        if unknown >= 0:
+            raise CutStateError(
+                f'the tetrahedron with nodes {tables.parent_nodes[unknown].tolist()} is crossed '
+                'in a way that is none of the cases A to H; abort the stroke'
+            )
+        bad, worst = spoiled(pieces, tables, mesh.rest, moves.rows, moves.where, floor)
+        if len(bad) == 0:
+            break
+        if attempt == 0:
+            plain, moves = _soften(tables, bad, edges, moves)
+        elif sum(block(tables, int(parent), edges) for parent in bad) == 0:
+            break
+    if len(pieces.corners) and worst <= 0.0:
+        raise CutStateError('an element would be turned over; abort the stroke')
+    return pieces, moves, float(worst)
+
+
+def _soften(
+    tables: Tables, bad: np.ndarray, edges: np.ndarray, moves: _Moves
+) -> tuple[np.ndarray, _Moves]:
+    """Midpoints and centroids in some parents, whose nodes stay where they are."""
+    nodes = tables.parent_nodes[bad]
+    keys = []
+    for base in nodes.tolist():
+        for i, j in _PAIRS:
+            row = find_edge(tables, base[i], base[j])
+            if row >= 0 and tables.edge_state[row] == DONE:
+                keys.append(edge_key(base[i], base[j]))
+                if row in edges:
+                    tables.edge_share[row] = 0.5
+    stay = ~np.isin(tables.node_id[moves.rows], nodes)
+    return np.array(keys, np.int64), _Moves(moves.rows[stay], moves.where[stay])
+
+
+def _assemble(
+    mesh: TetMesh,
+    positions: np.ndarray,
+    tables: Tables,
+    edges: np.ndarray,
+    nodes: np.ndarray,
+    parents: np.ndarray,
+    pieces: Pieces,
+    moves: _Moves,
+    worst: float,
+) -> Batch:
+    """Duplicates nodes, writes the delta down, and lets the tables follow it."""
+    n, m = mesh.node_count, len(mesh.tetrahedra)
+    concerned = nodes_concerned(pieces, mesh.links, tables, positions, nodes, n)
+    patch = lay_patch(pieces, concerned, mesh.links, tables, positions, n)
+    before = patch.corners.copy()
+    copies = split_stars(patch, concerned, mesh.rest, pieces.new_rest)
+    area, separated = cut_area(
+        patch, pieces, tables, before, mesh.rest, pieces.new_rest, moves.rows, moves.where
+    )
+    changed = np.flatnonzero((patch.tetrahedra >= 0) & (patch.corners != before).any(axis=1))
+    stayed = patch.tetrahedra[changed]
+    removed = np.sort(np.concatenate([pieces.removed, stayed]))[::-1]
+    delta = _delta(mesh, tables, patch, pieces, copies, moves, changed, removed)
+    owners = np.concatenate([pieces.owners, tables.owner[stayed]]).astype(np.int64)
+    labels = np.concatenate([pieces.labels, tables.label[stayed]])
+    copied = np.concatenate([np.full(len(pieces.new_rest), -1), copies]).astype(np.int64)
+    copied[copied >= n] = -1
+    tables = with_room(
+        tables,
+        mesh_nodes=n + len(copied),
+        tetrahedra=m + len(owners),
+        nodes=0,
+        edges=0,
+        parents=0,
+    )
+    settle(tables, m, np.ascontiguousarray(removed), owners, labels)
+    settle_nodes(tables, n, np.sort(pieces.orphans)[::-1].copy(), copied)
+    tables.node_plane[moves.rows, 3] = 0.0
+    cases = _count_cases(tables, parents, pieces.states, separated)
+    report = Report(
+        cases=cases,
+        area=float(area),
+        worst_altitude=worst if len(pieces.corners) else 0.0,
+        warnings=_warnings(tables, edges, small_pieces(patch, pieces, mesh.links)),
+    )
+    size = (n + len(copied) - len(pieces.orphans), m + len(owners) - len(removed))
+    return Batch(tables, delta, report, size)
+
+
+def _warnings(tables: Tables, edges: np.ndarray, sizes: np.ndarray) -> tuple[str, ...]:
+    free = [f'a piece of {size} tetrahedra has come free' for size in sizes.tolist()]
+    blocked = int((tables.edge_state[edges] == BLOCKED).sum())
+    if blocked:
+        free.append(f'{blocked} edges were too small to divide: tissue holds together there')
+    return tuple(free)
+
+
+def _delta(
+    mesh: TetMesh,
+    tables: Tables,
+    patch: Patch,
+    pieces: Pieces,
+    copies: np.ndarray,
+    moves: _Moves,
+    changed: np.ndarray,
+    removed: np.ndarray,
+) -> TopologyDelta:
+    n = mesh.node_count
+    moved = tables.node_id[moves.rows]
+    share = tables.slide[moves.rows, :1]
+    where_parents = np.stack([moved, tables.slide_to[moves.rows], moved, moved], axis=1)
+    where_weights = np.concatenate([1 - share, share, 0 * share, 0 * share], axis=1)
+    copy_parents = np.repeat(copies[:, None], 4, axis=1)
+    copy_weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(copies), 1))
+    for k, source in enumerate(copies.tolist()):
+        if source >= n:
+            copy_parents[k] = pieces.new_parents[source - n]
+            copy_weights[k] = pieces.new_weights[source - n]
+        elif source in moved:
+            j = int(np.flatnonzero(moved == source)[0])
+            copy_parents[k], copy_weights[k] = where_parents[j], where_weights[j]
+    count = len(pieces.corners)
+    stayed = patch.tetrahedra[changed]
+    outer = outer_bits_of(mesh.links, stayed)
+    return TopologyDelta(
+        node_parents=np.concatenate([pieces.new_parents, copy_parents]),
+        node_weights=np.concatenate([pieces.new_weights, copy_weights]),
+        moved_nodes=moved,
+        moved_parents=where_parents,
+        moved_weights=where_weights,
+        removed_tetrahedra=removed,
+        tetrahedra=np.concatenate([patch.corners[:count], patch.corners[changed]]),
+        outer_faces=np.concatenate([pieces.outer, outer]),
+    )
+
+
+def _count_cases(
+    tables: Tables, parents: np.ndarray, states: np.ndarray, separated: int
+) -> np.ndarray:
+    cases = np.zeros(len(CASES), np.int64)
+    new = (states >= 0) & (states != tables.parent_state[parents])
+    np.add.at(cases, _CASE_OF_STATE[states[new]], 1)
+    tables.parent_state[parents] = states
+    cases[CASES.index('separated')] = separated
+    return cases
+
+
+def give_up_edges(tables: Tables) -> None:
+    """Lets no pending crossing divide an edge: only nodes are cut."""
+    states = tables.edge_state[: tables.counts[EDGES]]
+    states[states == PENDING] = BLOCKED

@@ -1,0 +1,150 @@
+"""What a cut must keep (docs/cutting.md), as checks for tests and for `trainer fuzz-cuts`."""
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from tissue_sim.mesh import TetMesh
+from tissue_sim.topology import CUT, FACE_NODES
+
+
+class ViolationError(AssertionError):
+    """A cut has broken an invariant."""
+
+
+def _claim(holds: bool, message: str) -> None:
+    if not holds:
+        raise ViolationError(message)
+
+
+def lips(mesh: TetMesh) -> np.ndarray:
+    """Rest positions of the corners of the triangles that cuts have opened [m], shape (k, 3, 3)."""
+    return mesh.rest[mesh.triangles[mesh.triangle_kind == CUT]]
+
+
+def check_mesh(
+    mesh: TetMesh, volume: float, old_lips: np.ndarray | None = None, *, tolerance: float = 1e-12
+) -> None:
+    """Checks that a mesh is conforming, positive, without pinches and orphans, and has the given
+    volume.
+
+    Args:
+        mesh: after a batch.
+        volume: total rest volume that it has to have [m^3].
+        old_lips: `lips` when the stroke began; these may be divided on one side only.
+        tolerance: relative.
+
+    Raises:
+        ViolationError: saying what is broken, and where.
+    """
+    tets = mesh.tetrahedra.astype(np.int64)
+    volumes = mesh.volumes()
+    worst = int(volumes.argmin())
+    _claim(volumes[worst] > 0, f'tetrahedron {worst} {tets[worst]} has volume {volumes[worst]:.3g}')
+    error = abs(volumes.sum() / volume - 1)
+    _claim(error < tolerance, f'the volume is off by {error:.3g}')
+    used = np.unique(tets)
+    _claim(
+        len(used) == mesh.node_count and used[-1] == mesh.node_count - 1,
+        'a node belongs to no tetrahedron',
+    )
+    faces = np.sort(tets[:, FACE_NODES].reshape(-1, 3), axis=1)
+    unique, inverse, counts = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    _claim(
+        counts.max() <= 2, f'face {unique[counts.argmax()]} belongs to {counts.max()} tetrahedra'
+    )
+    across = _pairs(inverse.ravel(), len(unique)).reshape(-1, 4)
+    _claim(bool((across == mesh.neighbors).all()), 'the adjacency differs from a rebuild')
+    _check_surface(mesh, tets)
+    _check_pinches(tets, across, mesh.node_count)
+    _check_hanging(mesh, np.zeros((0, 3, 3)) if old_lips is None else old_lips)
+
+
+def _pairs(face: np.ndarray, count: int) -> np.ndarray:
+    first = np.full(count, -1)
+    last = np.full(count, -1)
+    index = np.arange(len(face))
+    last[face] = index
+    first[face[::-1]] = index[::-1]
+    other = np.where(first[face] == index, last[face], first[face])
+    return np.where(other == index, -1, other)
+
+
+def _check_surface(mesh: TetMesh, tets: np.ndarray) -> None:
+    free = np.argwhere(mesh.neighbors < 0)
+    want = np.sort(tets[free[:, :1], FACE_NODES[free[:, 1]]], axis=1)
+    have = np.sort(mesh.triangles.astype(np.int64), axis=1)
+    _claim(len(have) == len(want), 'the surface has another number of triangles than a rebuild')
+    same = want[np.lexsort(want.T)] == have[np.lexsort(have.T)]
+    _claim(bool(same.all()), 'the surface differs from a rebuild')
+
+
+def corner_groups(tets: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Group of each corner; corners at a node are one where faces with the node connect them,
+    shape (4 m,).
+    """
+    tet, face = np.nonzero(across >= 0)
+    other = across[tet, face] // 4
+    ones, twos = [], []
+    for i in range(4):
+        for j in range(4):
+            same = (i != face) & (tets[tet, i] == tets[other, j])
+            ones.append(4 * tet[same] + i)
+            twos.append(4 * other[same] + j)
+    one, two = np.concatenate(ones), np.concatenate(twos)
+    graph = coo_array((np.ones(len(one)), (one, two)), shape=(4 * len(tets),) * 2)
+    return connected_components(graph, directed=False)[1]
+
+
+def _check_pinches(tets: np.ndarray, across: np.ndarray, nodes: int) -> None:
+    groups = corner_groups(tets, across)
+    pairs = np.unique(np.stack([tets.ravel(), groups]), axis=1)
+    stars = np.bincount(pairs[0], minlength=nodes)
+    _claim(stars.max() == 1, f'node {int(stars.argmax())} holds parts together that share no face')
+
+
+def _check_hanging(mesh: TetMesh, old_lips: np.ndarray) -> None:
+    """Every new free face of the cut has its counterpart on the other lip: no node hangs."""
+    corners = lips(mesh)
+    if len(corners) == 0:
+        return
+    faces = np.sort(_place_numbers(corners), axis=1)
+    _, inverse, counts = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    alone = corners[counts[inverse.ravel()] % 2 == 1].mean(axis=1)
+    lost = alone[~_lie_in(alone, old_lips)]
+    if len(lost):
+        raise ViolationError(
+            f'the face of the cut at {lost[0]} has no counterpart on the other lip'
+        )
+
+
+def _place_numbers(corners: np.ndarray) -> np.ndarray:
+    """One number for each place, shape (k, 3), of corners (k, 3, 3)."""
+    _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return number.reshape(-1, 3)
+
+
+def _lie_in(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Which points, shape (p, 3), lie in one of some triangles, shape (k, 3, 3), but for
+    rounding.
+    """
+    found = np.zeros(len(points), bool)
+    for a, b, c in triangles:
+        normal = np.cross(b - a, c - a)
+        size = float(np.linalg.norm(normal))
+        rest = points - a
+        near = np.abs(rest @ normal) <= 1e-7 * size**1.5
+        if near.any():
+            for p, q in ((a, b), (b, c), (c, a)):
+                near &= np.cross(q - p, points - p) @ normal >= -1e-7 * size**2
+            found |= near
+    return found
+
+
+def pieces(mesh: TetMesh) -> np.ndarray:
+    """Which face-connected piece each tetrahedron belongs to, shape (m,)."""
+    tet, face = np.nonzero(mesh.neighbors >= 0)
+    other = mesh.neighbors[tet, face] // 4
+    m = len(mesh.tetrahedra)
+    graph = coo_array((np.ones(len(tet)), (tet, other)), shape=(m, m))
+    return connected_components(graph, directed=False)[1]

@@ -1,0 +1,269 @@
+"""Which edges and nodes a sweep crosses, in the deformed tissue (thesis 5.4.3; docs/cutting.md)."""
+
+import numpy as np
+from numba import njit
+
+from cutting.geometry import EDGE_NODES, orientation
+from cutting.lookup import base_of, edge_key, edge_slot, is_on_cut
+from tissue_sim.topology import FACE_NODES
+
+_EXACT = 1e-6
+"""A node nearer to the swept surface than this share of an edge is on it."""
+_SMALLEST = 1e-14
+HAIR = 2e-5
+"""Sweeps begin this much behind where the last one ended [m]: tissue moves in between."""
+
+
+def surfaces(corners: np.ndarray) -> np.ndarray:
+    """The two triangles of a sweep, begun a hair earlier.
+
+    Args:
+        corners: root before, tip before, tip after, root after [m], shape (4, 3).
+
+    Returns:
+        Shape (2, 3, 3); one of them may be flat, when the blade turns about an end.
+    """
+    a, b, c, d = corners
+    back = []
+    for start, end in ((a, d), (b, c)):
+        length = np.linalg.norm(end - start)
+        back.append(start - (end - start) * (HAIR / length) if length > HAIR / 100 else start)
+    return np.array([[back[0], back[1], c], [back[0], c, d]])
+
+
+@njit(cache=True)
+def _normals(triangles):
+    """Unit normals of triangles (k, 3, 3), and twice their areas [m^2]."""
+    normals = np.empty((len(triangles), 3))
+    sizes = np.empty(len(triangles))
+    for k in range(len(triangles)):
+        n = np.cross(triangles[k, 1] - triangles[k, 0], triangles[k, 2] - triangles[k, 0])
+        sizes[k] = np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+        normals[k] = n / max(sizes[k], _SMALLEST)
+    return normals, sizes
+
+
+@njit(cache=True)
+def _height(n, a, x):
+    return n[0] * (x[0] - a[0]) + n[1] * (x[1] - a[1]) + n[2] * (x[2] - a[2])
+
+
+@njit(cache=True)
+def _inside(triangle, n, x, slack):
+    """Whether a point of the triangle's plane is inside it, or within `slack` of its border [m]."""
+    for i in range(3):
+        a, b = triangle[i], triangle[(i + 1) % 3]
+        ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        px, py, pz = x[0] - a[0], x[1] - a[1], x[2] - a[2]
+        side = n[0] * (ey * pz - ez * py) + n[1] * (ez * px - ex * pz) + n[2] * (ex * py - ey * px)
+        if side < -slack * np.sqrt(ex * ex + ey * ey + ez * ez):
+            return False
+    return True
+
+
+@njit(cache=True)
+def _near(triangle, n, slack, positions, corners):
+    """Whether a tetrahedron reaches to both sides of the triangle's plane, within the triangle's
+    box.
+    """
+    above = below = False
+    for k in range(4):
+        height = _height(n, triangle[0], positions[corners[k]])
+        above |= height >= -slack
+        below |= height <= slack
+    if not (above and below):
+        return False
+    for i in range(3):
+        low, high = np.inf, -np.inf
+        for k in range(4):
+            low = min(low, positions[corners[k], i])
+            high = max(high, positions[corners[k], i])
+        if min(triangle[0, i], triangle[1, i], triangle[2, i]) > high + slack:
+            return False
+        if max(triangle[0, i], triangle[1, i], triangle[2, i]) < low - slack:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _surface_seeds(triangles, slack, links, positions, seeds):
+    """Tetrahedra under surface triangles whose box meets the box of the sweep."""
+    low, high = np.empty(3), np.empty(3)
+    for i in range(3):
+        low[i] = triangles[:, :, i].min() - slack
+        high[i] = triangles[:, :, i].max() + slack
+    nodes = links.triangles
+    for k in range(links.counts[1]):
+        apart = False
+        for i in range(3):
+            a, b, c = (
+                positions[nodes[k, 0], i],
+                positions[nodes[k, 1], i],
+                positions[nodes[k, 2], i],
+            )
+            if min(a, b, c) > high[i] or max(a, b, c) < low[i]:
+                apart = True
+                break
+        if not apart:
+            seeds.append(np.int64(links.triangle_face[k] // 4))
+
+
+@njit(cache=True)
+def met_tetrahedra(triangles, links, positions, near_nodes, everywhere):
+    """Tetrahedra that a sweep may cross: a few too many, never too few.
+
+    From the stars of the nodes where the blade was, and from the surface, then from neighbour to
+    neighbour.
+
+    Args:
+        triangles: of the sweep [m], shape (2, 3, 3).
+        links: connectivity.
+        positions: current nodes [m], shape (n, 3).
+        near_nodes: where the blade was, shape (k,).
+        everywhere: begin from all tetrahedra.
+
+    Returns:
+        Shape (t,).
+    """
+    normals, sizes = _normals(triangles)
+    slack = 0.0
+    for i in range(3):
+        slack = max(slack, 1e-6 * (triangles[:, :, i].max() - triangles[:, :, i].min()))
+    queue = [np.int64(0) for _ in range(0)]
+    if everywhere:
+        for each in range(links.counts[0]):
+            queue.append(np.int64(each))
+    else:
+        _surface_seeds(triangles, slack, links, positions, queue)
+        for node in near_nodes:
+            corner = links.first_corner[node]
+            while corner >= 0:
+                queue.append(np.int64(corner // 4))
+                corner = links.corner_next[corner]
+    met = [np.int64(0) for _ in range(0)]
+    seen = set(queue)
+    tetrahedra, first_corner, corner_next = links.tetrahedra, links.first_corner, links.corner_next
+    while len(queue) > 0:
+        at = queue.pop()
+        near = False
+        for k in range(2):
+            near |= sizes[k] > _SMALLEST and _near(
+                triangles[k], normals[k], slack, positions, tetrahedra[at]
+            )
+        if not near:
+            continue
+        met.append(at)
+        for i in range(4):
+            corner = first_corner[tetrahedra[at, i]]
+            while corner >= 0:
+                other = np.int64(corner // 4)
+                if other not in seen:
+                    seen.add(other)
+                    queue.append(other)
+                corner = corner_next[corner]
+    return np.array(met) if len(met) else np.zeros(0, np.int64)
+
+
+@njit(cache=True)
+def find_hits(triangles, links, tables, positions, met):
+    """Edges that cross the sweep, and nodes that lie on it; each edge is tested once.
+
+    Edges already in the table, and edges of nodes on the cut, are left out.
+
+    Args:
+        triangles: of the sweep [m], shape (2, 3, 3).
+        links, tables: mesh and stroke.
+        positions: current nodes [m], shape (n, 3).
+        met: tetrahedra to look at, shape (t,).
+
+    Returns:
+        Nodes a, b, with b = -1 for a node on the surface, shape (k, 2); and by row the share of the
+        way from
+        a to b, the normal of the triangle, the crossing point [m], shape (k, 7).
+    """
+    nodes = np.empty((10 * len(met), 2), np.int64)
+    data = np.empty((10 * len(met), 7))
+    count = 0
+    seen = {np.int64(-1)}
+    base = np.empty(4, np.int64)
+    x = np.empty(3)
+    normals, sizes = _normals(triangles)
+    extents = np.array([np.ptp(triangles[0]), np.ptp(triangles[1])])
+    tetrahedra, origin, owner = links.tetrahedra, tables.origin, tables.owner
+    parent_nodes, hash_key = tables.parent_nodes, tables.hash_key
+    row, side, state = tables.node_row, tables.node_side, tables.node_state
+    for tet in met:
+        base_of(tetrahedra, origin, owner, parent_nodes, tet, base)
+        for pair in range(10):
+            i, j = (EDGE_NODES[pair, 0], EDGE_NODES[pair, 1]) if pair < 6 else (pair - 6, pair - 6)
+            a, b = min(base[i], base[j]), max(base[i], base[j])
+            key = edge_key(a, b)
+            if key in seen:
+                continue
+            seen.add(key)
+            if is_on_cut(row, side, state, a) or is_on_cut(row, side, state, b):
+                continue
+            if hash_key[edge_slot(hash_key, key)] != -1:
+                continue
+            for k in range(2):
+                if sizes[k] <= _SMALLEST:
+                    continue
+                share = _crossing(
+                    triangles[k], normals[k], extents[k], positions, a, b, base[(i + 1) % 4], x
+                )
+                if share >= 0.0:
+                    nodes[count, 0] = a
+                    nodes[count, 1] = b if a != b else -1
+                    data[count, 0] = share
+                    data[count, 1:4] = normals[k]
+                    data[count, 4:7] = x
+                    count += 1
+                    break
+    return nodes[:count], data[:count]
+
+
+@njit(cache=True)
+def _crossing(triangle, n, extent, positions, a, b, near, x):
+    """Share of the way from a to b where the edge crosses the triangle, else -1; a node has b = a.
+
+    The length that is next to nothing for a node is a share of its edge to `near`.
+    """
+    p, q = positions[a], positions[b if b != a else near]
+    slack = 1e-6 * extent
+    above, below = _height(n, triangle[0], p), _height(n, triangle[0], q)
+    length = np.sqrt((q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2)
+    if a == b:
+        x[:] = p
+        on_it = abs(above) <= _EXACT * length and _inside(triangle, n, x, slack)
+        return 0.0 if on_it else -1.0
+    if above * below >= 0.0 or min(abs(above), abs(below)) <= _EXACT * length:
+        return -1.0
+    share = above / (above - below)
+    for i in range(3):
+        x[i] = p[i] + share * (q[i] - p[i])
+    return share if _inside(triangle, n, x, slack) else -1.0
+
+
+@njit(cache=True)
+def segment_meets(p, q, positions, corners):
+    """Whether the segment p q meets a tetrahedron.
+
+    Args:
+        p, q: ends [m], shape (3,).
+        positions: current nodes [m], shape (n, 3).
+        corners: nodes of the tetrahedron, shape (4,).
+    """
+    low, high = 0.0, 1.0
+    for face in range(4):
+        a = positions[corners[FACE_NODES[face, 0]]]
+        b = positions[corners[FACE_NODES[face, 1]]]
+        c = positions[corners[FACE_NODES[face, 2]]]
+        # Outside where the volume with the outward face is positive; clip the segment.
+        s, e = orientation(a, b, c, p), orientation(a, b, c, q)
+        if s > 0.0 and e > 0.0:
+            return False
+        if s > 0.0:
+            low = max(low, s / (s - e))
+        elif e > 0.0:
+            high = min(high, s / (s - e))
+    return low <= high
