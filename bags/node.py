@@ -1,0 +1,280 @@
+"""Node `recorder`: every topic of the graph, as it comes, into a bag."""
+
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from bags.decode import message_class
+from bags.errors import BagError
+from bags.message_text import schema_text
+from bags.qos import OfferedQos
+from bags.sequences import SequenceCounter
+from bags.writer import BagWriter
+from tissue_sim.ros import (
+    ARM,
+    CONTACT,
+    DIAGNOSTICS,
+    EVENTS,
+    FORCE,
+    LATCHED,
+    MESH,
+    MESH_UPDATES,
+    STREAM,
+    UPDATES,
+    Diagnostics,
+    Stop,
+    announce_ready,
+    polled,
+    run,
+)
+
+FORMAT_VERSION = '1'
+"""Version of what our bags hold beyond rosbag2's own format; grows when a reader must know."""
+
+_POLL = 0.004
+_DISCOVER = 0.02
+_REVIEW = 1.0
+_FLUSH = 0.2
+_QUEUE = 1000
+"""Messages that a topic may have waiting: a second of a 1 kHz stream."""
+
+_CONFIGURED = {
+    MESH: LATCHED,
+    MESH_UPDATES: UPDATES,
+    FORCE: STREAM,
+    CONTACT: STREAM,
+    DIAGNOSTICS: EVENTS,
+    f'{ARM}/measured_cp': STREAM,
+    f'{ARM}/measured_cv': STREAM,
+    f'{ARM}/measured_cf': STREAM,
+    f'{ARM}/servo_cf': STREAM,
+    f'{ARM}/operating_state': LATCHED,
+}
+"""Depths of our publishers: the graph tells every other part of a QoS, but not its history."""
+
+
+class _Stream:
+    """One recorded topic: its subscription, taken from by polling, and what came of it."""
+
+    def __init__(self, topic: str, subscription: Any, count_publishers: Callable[[], int]) -> None:
+        self.topic = topic
+        self.message_type = subscription.msg_type
+        self.take = subscription.handle.take_message
+        self.qos = subscription.qos_profile
+        self.counter = SequenceCounter(count_publishers)
+
+
+class Recorder(Node):
+    """Subscribes to whatever the graph has and writes it to the bag named by the parameter `bag`.
+
+    Parameters:
+        bag: folder of the new bag.
+        scene: scene file, of which the text goes into the bag; none when empty.
+        seed: of the session; goes into the bag.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('recorder')
+        folder = str(self.declare_parameter('bag', '').value)
+        if not folder:
+            raise BagError('the parameter "bag" is missing: name the folder of the new bag')
+        scene = str(self.declare_parameter('scene', '').value)
+        seed = int(self.declare_parameter('seed', 0).value)
+        self.writer = BagWriter(Path(folder), custom_data=_custom_data(scene, seed))
+        self._streams: dict[str, _Stream] = {}
+        self._unrecorded: dict[str, str] = {}
+        self._closed = False
+        self._depths = {
+            self.resolve_topic_name(name): profile.depth for name, profile in _CONFIGURED.items()
+        }
+        self._diagnostics = Diagnostics(self, self._collect)
+
+    def discover(self) -> None:
+        """Subscribes to topics that have got their first publisher since the last time."""
+        for topic, types in self.get_topic_names_and_types():
+            if topic not in self._streams and topic not in self._unrecorded:
+                self._start(topic, types[0])
+
+    def review(self) -> None:
+        """Looks at the publishers of recorded topics anew."""
+        for stream in self._streams.values():
+            publishers = self.get_publishers_info_by_topic(stream.topic)
+            weaker = [p.node_name for p in publishers if not _compatible(p.qos_profile, stream.qos)]
+            if weaker and stream.topic not in self._unrecorded:
+                self._give_up(
+                    stream.topic,
+                    f'{", ".join(weaker)} came later and offers a weaker QoS than those before',
+                )
+
+    def drain(self) -> None:
+        """Takes all that has come and gives it to the writer in the order of arrival."""
+        batch = []
+        for stream in list(self._streams.values()):
+            while (taken := stream.take(stream.message_type, True)) is not None:
+                data, info = taken
+                number = info['publication_sequence_number']
+                stream.counter.add(number)
+                received = info['received_timestamp'] or time.time_ns()
+                batch.append((received, stream.topic, info['source_timestamp'], data, number))
+        batch.sort(key=itemgetter(0))
+        for received, topic, published, data, number in batch:
+            self.writer.write(topic, received, published, data, number or 0)
+
+    def close(self) -> None:
+        """Takes the last messages, completes the bag and says what became of all."""
+        if self._closed:
+            return
+        self._closed = True
+        self.drain()
+        self.writer.close()
+        lost, before = self._lost()
+        tally = self.writer.tally
+        print(
+            f'recorded: {tally.messages} messages, {len(tally.counts)} topics, '
+            f'{sum(lost.values())} lost, {self.writer.folder}',
+            flush=True,
+        )
+        for topic, count in lost.items():
+            print(f'  lost: {count} of {topic}', flush=True)
+        for topic, count in before.items():
+            print(
+                f'  not heard: the first {count} of {topic}, sent before the recorder knew',
+                flush=True,
+            )
+        for topic, reason in self._unrecorded.items():
+            print(f'  not recorded: {topic}: {reason}', flush=True)
+        if self.writer.failure:
+            print(f'  {self.writer.failure}', flush=True)
+
+    def _start(self, topic: str, type_name: str) -> None:
+        publishers = self.get_publishers_info_by_topic(topic)
+        if not publishers:
+            return
+        try:
+            message_type, schema = message_class(type_name), schema_text(type_name)
+        except BagError as error:
+            self._give_up(topic, str(error))
+            return
+        depth = self._depths.get(topic, 10)
+        profiles = dict.fromkeys(_offered(info.qos_profile, depth) for info in publishers)
+        # rosbags looks up hashes of messages only, and refuses a bag that has any other.
+        type_hash = str(publishers[0].topic_type_hash) if '/msg/' in type_name else ''
+        self.writer.add_topic(topic, type_name, schema, type_hash, tuple(profiles))
+        subscription = polled(self, message_type, topic, _request(publishers))
+        self._streams[topic] = _Stream(
+            topic, subscription, lambda: len(self.get_publishers_info_by_topic(topic))
+        )
+
+    def _give_up(self, topic: str, reason: str) -> None:
+        self._unrecorded[topic] = reason
+        self.get_logger().warning(f'not recorded: {topic}: {reason}')
+
+    def _lost(self) -> tuple[dict[str, int], dict[str, int]]:
+        """By topic: messages lost on the way or by the disk; those sent before the first heard."""
+        refused = self.writer.lost
+        lost = {t: s.counter.lost + refused.get(t, 0) for t, s in self._streams.items()}
+        before = {t: s.counter.before for t, s in self._streams.items()}
+        return {t: n for t, n in lost.items() if n}, {t: n for t, n in before.items() if n}
+
+    def _collect(self) -> tuple[bytes, str, dict[str, object]]:
+        lost, before = self._lost()
+        values: dict[str, object] = {
+            'received': sum(stream.counter.received for stream in self._streams.values()),
+            'written': self.writer.tally.messages,
+            'lost': sum(lost.values()),
+            'bytes': self.writer.size,
+        }
+        values |= {f'lost {topic}': count for topic, count in lost.items()}
+        values |= {f'not heard {topic}': count for topic, count in before.items()}
+        values |= {f'not recorded {topic}': reason for topic, reason in self._unrecorded.items()}
+        if self.writer.failure:
+            return DiagnosticStatus.ERROR, self.writer.failure, values
+        if lost or self._unrecorded:
+            return DiagnosticStatus.WARN, 'the bag is not whole', values
+        return DiagnosticStatus.OK, 'recording', values
+
+
+def record(node: Recorder, stop: Stop) -> None:
+    """Records until `stop` is set."""
+    node.discover()
+    announce_ready(node)
+    due = dict.fromkeys((node.discover, node.review, node.writer.flush), 0.0)
+    periods = {node.discover: _DISCOVER, node.review: _REVIEW, node.writer.flush: _FLUSH}
+    while not stop.is_set():
+        time.sleep(_POLL)
+        node.drain()
+        now = time.monotonic()
+        for act, period in periods.items():
+            if now >= due[act]:
+                due[act] = now + period
+                act()
+
+
+def main() -> None:
+    """Runs the node."""
+    run(Recorder, record)
+
+
+def _custom_data(scene: str, seed: int) -> dict[str, str]:
+    data = {
+        'format_version': FORMAT_VERSION,
+        'seed': str(seed),
+        'python_version': platform.python_version(),
+    }
+    for package in ('ros-jazzy-rclpy', 'rclpy', 'numpy', 'numba', 'mcap'):
+        try:
+            data[f'{package}_version'] = version(package)
+        except PackageNotFoundError:
+            continue
+    if scene:
+        try:
+            data['scene'] = Path(scene).read_text(encoding='utf-8')
+        except OSError as error:
+            raise BagError(f'cannot read the scene {scene}: {error.strerror}') from None
+        data['scene_file'] = Path(scene).name
+    return data
+
+
+def _offered(profile: QoSProfile, depth: int) -> OfferedQos:
+    return OfferedQos(
+        depth=depth,
+        reliability=profile.reliability.name.lower(),
+        durability=profile.durability.name.lower(),
+        deadline=profile.deadline.nanoseconds,
+        lifespan=profile.lifespan.nanoseconds,
+        liveliness=profile.liveliness.name.lower(),
+        liveliness_lease_duration=profile.liveliness_lease_duration.nanoseconds,
+    )
+
+
+def _request(publishers: list[Any]) -> QoSProfile:
+    """The strongest QoS that all of the publishers offer."""
+    profiles = [info.qos_profile for info in publishers]
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=_QUEUE,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
+    reliable = offered.reliability == ReliabilityPolicy.RELIABLE
+    latched = offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    return (reliable or requested.reliability == ReliabilityPolicy.BEST_EFFORT) and (
+        latched or requested.durability == DurabilityPolicy.VOLATILE
+    )
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,177 @@
+"""Reading bags without ROS, those that a crash has cut off included."""
+
+import struct
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from io import SEEK_END, BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message, Schema
+from mcap.stream_reader import breakup_chunk
+
+from bags.errors import BagError
+from bags.metadata import read_metadata
+
+_MAGIC = b'\x89MCAP0\r\n'
+_RECORD_HEAD = struct.Struct('<BQ')
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """One message of a bag.
+
+    Attributes:
+        topic: its topic.
+        type: `package/msg/Type`.
+        log_time: when it was received [ns since the epoch].
+        publish_time: its source time stamp [ns since the epoch].
+        sequence: its number in the sequence of its publisher, 0 where unknown.
+        data: CDR with its encapsulation header.
+    """
+
+    topic: str
+    type: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+
+
+class Bag:
+    """A bag on disk; made by `open_bag`.
+
+    Attributes:
+        path: the MCAP file.
+        complete: whether the file has its end; without it the recorder was killed or the disk full,
+            and the complete chunks are what is read.
+        custom_data: as the recorder wrote it: scene, seed, versions.
+        schemas: definition text by type.
+    """
+
+    def __init__(self, path: Path, custom_data: dict[str, str]) -> None:
+        self.path = path
+        self.custom_data = custom_data
+        self._topics: dict[str, str] = {}
+        self.schemas: dict[str, str] = {}
+        self.complete = self._read_summary()
+        if not self.complete:
+            for _ in self._salvage():
+                pass
+
+    def topics(self) -> dict[str, str]:
+        """Type by topic."""
+        return dict(self._topics)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        """Messages in the order of their log times (within a chunk only, where the end is missing).
+
+        Args:
+            topics: those to read; all by default.
+        """
+        source = self._indexed(topics) if self.complete else self._salvage()
+        for schema, channel, message in source:
+            if topics is None or channel.topic in topics:
+                yield Recorded(
+                    channel.topic,
+                    schema.name,
+                    message.log_time,
+                    message.publish_time,
+                    message.sequence,
+                    message.data,
+                )
+
+    def _know(self, schema: Schema, channel: Channel) -> None:
+        self._topics[channel.topic] = schema.name
+        self.schemas[schema.name] = schema.data.decode()
+
+    def _read_summary(self) -> bool:
+        with self.path.open('rb') as file:
+            # Without its end the last bytes are anything: the library would take them for records.
+            file.seek(-min(len(_MAGIC), self.path.stat().st_size), SEEK_END)
+            closed = file.read() == _MAGIC
+            file.seek(0)
+            if not closed:
+                return False
+            try:
+                summary = make_reader(file).get_summary()
+            except (McapError, struct.error):
+                return False
+        if summary is None:
+            return False
+        for channel in summary.channels.values():
+            self._know(summary.schemas[channel.schema_id], channel)
+        return True
+
+    def _indexed(self, topics: Collection[str] | None) -> Iterator[tuple[Schema, Channel, Message]]:
+        with self.path.open('rb') as file:
+            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(
+                topics
+            ):
+                assert schema is not None
+                yield schema, channel, message
+
+    def _salvage(self) -> Iterator[tuple[Schema, Channel, Message]]:
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        for chunk in _complete_chunks(self.path):
+            messages = []
+            for record in breakup_chunk(chunk, validate_crc=True):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                    self._know(schemas[record.schema_id], record)
+                elif isinstance(record, Message):
+                    messages.append(record)
+            for message in sorted(messages, key=lambda message: message.log_time):
+                channel = channels[message.channel_id]
+                yield schemas[channel.schema_id], channel, message
+
+
+def open_bag(folder: Path | str) -> Bag:
+    """Opens a bag for reading.
+
+    Args:
+        folder: the bag's folder, the one with metadata.yaml.
+
+    Raises:
+        BagError: it is not a bag of one MCAP file.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        raise BagError(f'{folder} is a file: name the folder of the bag, {folder.parent}')
+    information = read_metadata(folder)
+    names = information.get('relative_file_paths') or []
+    if information.get('storage_identifier') != 'mcap' or len(names) != 1:
+        raise BagError(f'{folder} is not a bag of one MCAP file: its metadata.yaml names {names}')
+    path = folder / Path(names[0]).name
+    if not path.is_file():
+        raise BagError(f'{folder} lacks its file {path.name}')
+    with path.open('rb') as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise BagError(f'{path} is not an MCAP file')
+    return Bag(path, dict(information.get('custom_data') or {}))
+
+
+def _complete_chunks(path: Path) -> Iterator[Chunk]:
+    """Chunks of a file up to the first record that is not all there."""
+    size = path.stat().st_size
+    with path.open('rb') as file:
+        file.seek(len(_MAGIC))
+        while head := _record_head(file):
+            opcode, length = head
+            if file.tell() + length > size:
+                return
+            body = file.read(length)
+            if opcode == Opcode.CHUNK:
+                yield Chunk.read(ReadDataStream(BytesIO(body)))
+
+
+def _record_head(file: BinaryIO) -> tuple[int, int] | None:
+    head = file.read(_RECORD_HEAD.size)
+    return _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else None
