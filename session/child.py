@@ -1,0 +1,17 @@
+"""Becomes another program that the kernel ends when this one's parent dies, whatever killed it.
+
+Run as a file: `python -I -S child.py PARENT_PID SIGNAL PROGRAM ARGUMENT...`. The process id stays.
+"""
+
+import ctypes
+import os
+import sys
+
+PR_SET_PDEATHSIG = 1
+
+if __name__ == '__main__':
+    parent, number, *program = sys.argv[1:]
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(number))
+    if os.getppid() != int(parent):
+        sys.exit('the parent died first')
+    os.execv(program[0], program)

@@ -1,0 +1,170 @@
+"""A whole session: the nodes, the bag, the table, the verdict."""
+
+import json
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.markup import escape
+
+from bags.errors import BagError
+from haptic_bridge.hand import compile_script
+from session.domain import reserved_domain
+from session.errors import SessionError
+from session.evidence import read_evidence
+from session.graph import ARM_NODE, BRIDGE_NODE, TISSUE_NODE, node_environment, session_nodes
+from session.judge import Expected, judge
+from session.node_process import NodeCommand
+from session.processes import Outcome, Supervisor
+from session.progress import SessionProgress
+from session.report import session_tables
+from session.scene import Scene, load_scene
+from session.status import Status
+from session.summary import Summary, summarise
+from tissue_sim.share import PACKAGES, is_checkout
+
+SESSIONS = (PACKAGES if is_checkout() else Path()) / 'bags' / 'sessions'
+"""In the checkout; in the current folder where the trainer is installed."""
+SHORTEST, LONGEST = 5.0, 86400.0  # [s]
+OVERTIME = 15.0
+"""How long [s] a session may last beyond its script, which waits for the haptic bridge."""
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """What the command line says.
+
+    Attributes:
+        scene: name or path.
+        seconds: duration of the arm's script [s]; None: what the scene says.
+        bag: folder of the new bag; None: one named after scene and time.
+        seed: of everything random.
+        domain: ROS domain, or `free`.
+        as_json: print the summary as JSON.
+    """
+
+    scene: str
+    seconds: float | None
+    bag: Path | None
+    seed: int
+    domain: int | Literal['free']
+    as_json: bool
+
+
+def run_demo(options: DemoOptions) -> Status:
+    """Runs a session and prints what became of it.
+
+    Raises:
+        SessionError, SceneError, SettingsError: it cannot be run like this.
+    """
+    scene = load_scene(options.scene)
+    seconds = _duration(scene, options.seconds)
+    bag = _new_bag(options.bag, scene.name)
+    nodes = session_nodes(scene.path, bag, options.seed, seconds)
+    console, notes = Console(), Console(stderr=True)
+    with reserved_domain(options.domain) as domain:
+        outcome = _run(nodes, seconds, bag, domain, notes)
+    if not outcome.ran:
+        return _not_run(outcome, bag, notes)
+    try:
+        with notes.status('reading the bag'):
+            summary = summarise(read_evidence(bag))
+    except BagError as error:
+        notes.print(f'[bold red]no summary:[/] {escape(str(error))}')
+        return _status(outcome, ['no summary'])
+    failures = judge(summary, outcome, expected_of(scene))
+    if options.as_json:
+        _print_json(summary, outcome, failures, console)
+    else:
+        console.print(session_tables(summary))
+    for failure in failures:
+        notes.print(f'[bold red]not as it should be:[/] {escape(failure)}', highlight=False)
+    return _status(outcome, failures)
+
+
+def expected_of(scene: Scene) -> Expected:
+    """What a session of a scene should do."""
+    rates = {
+        TISSUE_NODE: scene.tissue.integration.rate,
+        BRIDGE_NODE: scene.haptics.rate,
+        ARM_NODE: scene.arm.rate,
+    }
+    return Expected(rates, cut=scene.arm.script.cuts)
+
+
+def _duration(scene: Scene, asked: float | None) -> float:
+    """Of the arm's script [s], refused where the hand would have to be too fast."""
+    seconds = asked
+    if seconds is None:
+        seconds = scene.session.seconds or scene.arm.script.seconds
+    elif not SHORTEST <= seconds <= LONGEST:
+        raise SessionError(
+            f'--seconds is {seconds:g}: give a number from {SHORTEST:g} to {LONGEST:g}'
+        )
+    compile_script(scene.arm.script, scene.device.tissue_from_device, seconds)
+    return seconds
+
+
+def _new_bag(folder: Path | None, scene: str) -> Path:
+    if folder is None:
+        folder = SESSIONS / f'{scene}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}'
+        SESSIONS.mkdir(parents=True, exist_ok=True)
+    folder = folder.resolve()
+    if folder.exists():
+        raise SessionError(f'{folder} exists already: name a new folder for the bag')
+    if not folder.parent.is_dir():
+        raise SessionError(f'{folder.parent} does not exist: make it first, the bag goes into it')
+    return folder
+
+
+def _run(
+    nodes: list[NodeCommand], seconds: float, bag: Path, domain: int, notes: Console
+) -> Outcome:
+    environment = node_environment(domain)
+    with (
+        SessionProgress(notes, len(nodes)) as progress,
+        Supervisor(nodes, bag / 'log', environment, progress.tell) as supervisor,
+    ):
+        if supervisor.start():
+            supervisor.run(
+                seconds + OVERTIME,
+                until_done=ARM_NODE,
+                tick=lambda elapsed: progress.tick(elapsed, seconds),
+            )
+        return supervisor.end()
+
+
+def _not_run(outcome: Outcome, bag: Path, notes: Console) -> Status:
+    """Says why the nodes did not come up."""
+    if outcome.interrupted:
+        return Status.INTERRUPTED
+    for death in outcome.deaths:
+        refusal = next((line for line in death.tail if line.startswith('error: ')), None)
+        if death.returncode == Status.BAD_INPUT and refusal:
+            raise SessionError(f'{death.node}: {refusal.removeprefix("error: ")}')
+        for line in death.tail:
+            notes.print(f'  {death.node}: {escape(line)}', highlight=False)
+    if outcome.unready:
+        notes.print(f'[bold red]error:[/] {escape(outcome.unready)}', highlight=False)
+    notes.print(f'all that the nodes said is in {escape(str(bag / "log"))}', highlight=False)
+    return Status.NODE_DIED if outcome.deaths else Status.FAILED
+
+
+def _status(outcome: Outcome, failures: list[str]) -> Status:
+    if outcome.deaths:
+        return Status.NODE_DIED
+    if outcome.interrupted:
+        return Status.INTERRUPTED
+    return Status.FAILED if failures else Status.OK
+
+
+def _print_json(summary: Summary, outcome: Outcome, failures: list[str], console: Console) -> None:
+    plain = summary.plain() | {
+        'finished': outcome.finished,
+        'interrupted': outcome.interrupted,
+        'deaths': [death.sentence for death in outcome.deaths],
+        'failures': failures,
+    }
+    console.out(json.dumps(plain, indent=2), highlight=False)

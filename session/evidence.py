@@ -1,0 +1,124 @@
+"""What a bag has to say about a session, as plain numbers."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bags.reader import Recorded, open_bag
+from bags.sequences import SequenceCounter
+from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
+from session.graph import MODULES
+
+CONTACT, SERVO_CF, DIAGNOSTICS = '/tool/contact', '/arm/servo_cf', '/diagnostics'
+SHARED = (DIAGNOSTICS, '/parameter_events', '/rosout')
+"""Topics that every node publishes on: their messages are of several sequences."""
+NANOSECOND = 1e-9
+
+
+@dataclass(frozen=True)
+class Status:
+    """One status of one node on /diagnostics.
+
+    Attributes:
+        time: when it was recorded [s].
+        node: its name.
+        level: 0 OK, 1 WARN, 2 ERROR, 3 STALE.
+        message: its sentence.
+        values: as text, by key.
+    """
+
+    time: float
+    node: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+    def number(self, key: str) -> float:
+        """A value as a number; NaN where there is none."""
+        try:
+            return float(self.values[key])
+        except (KeyError, ValueError):
+            return float('nan')
+
+
+@dataclass
+class Evidence:
+    """A session's bag. Times are those of recording, [s] since its first message.
+
+    Attributes:
+        bag: its folder.
+        complete: whether the bag was closed in order.
+        duration: [s].
+        contacts: time and whether something is touched, by `tool/contact`, shape (n, 2).
+        forces: time and norm [N] of `arm/servo_cf`, shape (m, 2).
+        statuses: all of /diagnostics.
+        messages: how many, by topic.
+        lost: messages that were published after the first that came, and did not, by topic.
+        unheard: messages published before the first that came, by topic.
+    """
+
+    bag: Path
+    complete: bool = True
+    duration: float = 0.0
+    contacts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    forces: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    statuses: list[Status] = field(default_factory=list)
+    messages: dict[str, int] = field(default_factory=dict)
+    lost: dict[str, int] = field(default_factory=dict)
+    unheard: dict[str, int] = field(default_factory=dict)
+
+
+def read_evidence(folder: Path) -> Evidence:
+    """Reads a bag once.
+
+    Raises:
+        BagError: it is not a bag.
+    """
+    bag = open_bag(folder)
+    evidence = Evidence(folder, complete=bag.complete)
+    counters = {t: SequenceCounter(partial(_count_publishers, t)) for t in bag.topics()}
+    state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
+    contact_codec, wrench_codec = ContactCodec(), WrenchStampedCodec()
+    contacts, forces = [], []
+    start = end = 0
+    for message in bag.messages():
+        start = start or message.log_time
+        end = max(end, message.log_time)
+        time = (message.log_time - start) * NANOSECOND
+        if message.sequence:
+            counters[message.topic].add(message.sequence)
+        evidence.messages[message.topic] = evidence.messages.get(message.topic, 0) + 1
+        if message.topic == CONTACT:
+            contacts.append((time, contact_codec.decode(message.data).values[state][0] != 0))
+        elif message.topic == SERVO_CF:
+            forces.append((time, np.linalg.norm(wrench_codec.decode(message.data).values[force])))
+        elif message.topic == DIAGNOSTICS:
+            evidence.statuses += _statuses(message, time)
+    evidence.duration = (end - start) * NANOSECOND
+    evidence.contacts = np.array(contacts, float).reshape(-1, 2)
+    evidence.forces = np.array(forces, float).reshape(-1, 2)
+    evidence.lost = {topic: c.lost for topic, c in counters.items() if c.lost}
+    evidence.unheard = {topic: c.before for topic, c in counters.items() if c.before}
+    return evidence
+
+
+def _count_publishers(topic: str) -> int:
+    return len(MODULES) if topic in SHARED else 1
+
+
+def _statuses(message: Recorded, time: float) -> list[Status]:
+    from bags.decode import decode  # needs ROS, which the rest of this module does not
+
+    return [
+        Status(
+            time,
+            status.name,
+            status.level[0],
+            status.message,
+            {value.key: value.value for value in status.values},
+        )
+        for status in decode(message).status
+    ]

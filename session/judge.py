@@ -1,0 +1,90 @@
+"""Did a session do what it should have? Every "no" is a sentence."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from session.processes import Outcome
+from session.summary import Summary
+
+RATE_TOLERANCE = 0.1
+NO_FORCE = 1e-3  # [N]
+ERROR_LEVEL = 2
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a scene asks of a session.
+
+    Attributes:
+        rates: [Hz] of the nodes that have one.
+        cut: the arm's script has a phase that cuts.
+    """
+
+    rates: Mapping[str, float]
+    cut: bool
+
+
+def judge(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
+    """What the session should have done and did not.
+
+    Args:
+        summary: of its bag.
+        outcome: of its processes.
+        expected: by its scene.
+
+    Returns:
+        Sentences; none if all is well. An interrupted session need not have got anywhere.
+    """
+    return [
+        *(death.sentence for death in outcome.deaths),
+        *(f'{name} had to be killed at the end' for name in outcome.killed),
+        *_bag(summary),
+        *_nodes(summary, expected),
+        *([] if outcome.interrupted else _touch(summary, outcome, expected)),
+    ]
+
+
+def _bag(summary: Summary) -> list[str]:
+    failures = []
+    if not summary.complete:
+        failures.append(f'{summary.bag} was not closed: what is there up to then can be read')
+    for topic, count in summary.lost.items():
+        failures.append(f'{count} messages of {topic} were lost on the way to the bag')
+    return failures
+
+
+def _nodes(summary: Summary, expected: Expected) -> list[str]:
+    failures = []
+    for name, nominal in expected.rates.items():
+        node = summary.nodes.get(name)
+        if node is None:
+            failures.append(f'{name} never reported on /diagnostics')
+        elif math.isnan(node.rate):
+            failures.append(f'{name} never reported its rate on /diagnostics')
+        elif abs(node.rate - nominal) > RATE_TOLERANCE * nominal:
+            failures.append(f'{name} ran at {node.rate:.4g} Hz instead of {nominal:g} Hz')
+    for node in summary.nodes.values():
+        if node.worst_level == ERROR_LEVEL:
+            failures.append(f'{node.name} reported an error: {node.message}')
+    return failures
+
+
+def _touch(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
+    failures = []
+    if summary.force_before_contact > NO_FORCE:
+        failures.append(
+            f'there was a force of {summary.force_before_contact:.3g} N before the first contact'
+        )
+    if not outcome.finished:
+        failures.append(f'the arm did not finish its script within {outcome.seconds:.0f} s')
+    if not summary.contact_time:
+        failures.append('the tool never touched the tissue')
+    elif not summary.largest_force:
+        failures.append('the contact was never felt: the force on the arm was zero throughout')
+    after = summary.force_after_contact
+    if outcome.finished and after is not None and after > NO_FORCE:
+        failures.append(f'there was a force of {after:.3g} N still after the last contact')
+    if expected.cut and not summary.elements_cut:
+        failures.append('nothing was cut, although the script has a cut in it')
+    return failures

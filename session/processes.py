@@ -1,0 +1,294 @@
+"""Starts the nodes of a session, watches them and ends them; nothing is left running."""
+
+import selectors
+import signal
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from session.node_process import NodeCommand, NodeProcess, is_warning
+
+STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+POLL = 0.05  # [s]
+MOST_SHOWN = 20
+ASKED_FOR = (0, -signal.SIGINT, -signal.SIGTERM)
+
+
+@dataclass(frozen=True)
+class Event:
+    """What the supervisor tells while it works; `text` is a sentence or a node's own line."""
+
+    kind: Literal['ready', 'phase', 'warning', 'died', 'ending', 'killed']
+    node: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Death:
+    """A node that ended although nobody asked it to.
+
+    Attributes:
+        node: its name.
+        returncode: exit status, or the negative number of the signal.
+        elapsed: [s] since the session started to run; None before every node was ready.
+        tail: the last lines that it wrote.
+    """
+
+    node: str
+    returncode: int
+    elapsed: float | None
+    tail: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Who died, how and when."""
+        when = 'before it was ready' if self.elapsed is None else f'after {self.elapsed:.1f} s'
+        return f'{self.node} died {when} ({describe(self.returncode)})'
+
+
+@dataclass
+class Outcome:
+    """How a session went, as far as its processes can tell.
+
+    Attributes:
+        ran: every node was ready.
+        finished: the node that was waited for said `done: NAME`.
+        interrupted: the user, or the system, asked for the end.
+        seconds: [s] from the last node being ready to the end.
+        deaths: of nodes, in order.
+        unready: sentence about who was not ready in time.
+        killed: nodes that did not end when asked to.
+    """
+
+    ran: bool = False
+    finished: bool = False
+    interrupted: bool = False
+    seconds: float = 0.0
+    deaths: list[Death] = field(default_factory=list)
+    unready: str = ''
+    killed: list[str] = field(default_factory=list)
+
+
+class Supervisor:
+    """Runs a set of nodes to the end of a session; use it as a context manager.
+
+    Everything happens in the calling thread, which must be the main one: the kernel ties the life
+    of the processes to it. SIGINT, SIGTERM and SIGHUP end the session in order; a second one kills
+    what has not ended by then, except nodes that record. Each node has a process group of its own,
+    so that a terminal's Ctrl-C reaches the supervisor alone.
+
+    Args:
+        commands: the nodes in the order in which they are ended, those that record last.
+        log_folder: gets one file a node as soon as the folder above it exists.
+        environment: of every node.
+        tell: is called with what happens.
+    """
+
+    def __init__(
+        self,
+        commands: Sequence[NodeCommand],
+        log_folder: Path,
+        environment: Mapping[str, str],
+        tell: Callable[[Event], None] = lambda event: None,
+    ) -> None:
+        self.outcome = Outcome()
+        self._commands = commands
+        self._logs = log_folder
+        self._environment = environment
+        self._tell = tell
+        self._nodes: dict[str, NodeProcess] = {}
+        self._selector = selectors.DefaultSelector()
+        self._interrupts = 0
+        self._began: float | None = None
+        self._handlers: dict[int, object] = {}
+
+    def __enter__(self) -> 'Supervisor':
+        for number in STOPPING_SIGNALS:
+            self._handlers[number] = signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self.end()
+        finally:
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)  # type: ignore[arg-type]
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids of the nodes that live, by name."""
+        return {name: node.process.pid for name, node in self._nodes.items() if node.alive}
+
+    def start(self, timeout: float = 60.0) -> bool:
+        """Starts the nodes that record, waits for them, and then starts the others.
+
+        Args:
+            timeout: [s] in which all must be ready.
+
+        Returns:
+            Whether all are ready; if not, the outcome says why.
+        """
+        deadline = time.monotonic() + timeout
+        for records in (True, False):
+            for command in self._commands:
+                if command.records == records and not self._interrupts:
+                    self._start(command)
+            if not self._wait_ready(deadline, timeout):
+                return False
+        self._began = time.monotonic()
+        self.outcome.ran = True
+        return True
+
+    def run(
+        self,
+        seconds: float,
+        *,
+        until_done: str = '',
+        tick: Callable[[float], object] = lambda elapsed: None,
+    ) -> None:
+        """Watches the session until it is over; deaths are told, and the other nodes go on.
+
+        Args:
+            seconds: [s] that it lasts at most.
+            until_done: the node whose line `done: NAME` ends it.
+            tick: is called often with the elapsed time [s].
+        """
+        assert self._began is not None, 'start() first'
+        elapsed = 0.0
+        while not self._interrupts and elapsed < seconds and self.pids:
+            self._poll(min(POLL, seconds - elapsed))
+            elapsed = time.monotonic() - self._began
+            tick(elapsed)
+            if until_done in self._nodes and self._nodes[until_done].done:
+                self.outcome.finished = True
+                break
+        self.outcome.seconds = elapsed
+
+    def end(self) -> Outcome:
+        """Ends every node: SIGINT, after the grace SIGTERM, at last SIGKILL to its group."""
+        patience = min(self._interrupts, 1)
+        if self.pids:
+            self._tell(Event('ending', '', 'ending the nodes'))
+        for records in (False, True):
+            nodes = [n for c in self._commands if (n := self._nodes.get(c.name)) is not None]
+            self._end([n for n in nodes if n.command.records == records], patience)
+        self._poll(0.0)
+        for node in self._nodes.values():
+            node.log.close()
+            node.pipe.close()
+        self._nodes.clear()
+        self._selector.close()
+        self._selector = selectors.DefaultSelector()
+        self.outcome.interrupted = self._interrupts > 0
+        return self.outcome
+
+    def _on_signal(self, number: int, frame: object) -> None:
+        self._interrupts += 1
+
+    def _start(self, command: NodeCommand) -> None:
+        node = NodeProcess(command, self._logs / f'{command.name}.log', self._environment)
+        self._nodes[command.name] = node
+        self._selector.register(node.pipe, selectors.EVENT_READ, node)
+
+    def _wait_ready(self, deadline: float, timeout: float) -> bool:
+        while not self._interrupts and not self.outcome.deaths:
+            waiting = [node for node in self._nodes.values() if not node.ready]
+            if not waiting:
+                return True
+            if time.monotonic() > deadline:
+                self.outcome.unready = _unready(waiting, timeout)
+                return False
+            self._poll(POLL)
+        return False
+
+    def _poll(self, timeout: float) -> None:
+        """Reads what has come within `timeout` [s] and takes note of who has ended."""
+        if self._selector.get_map():
+            for key, _ in self._selector.select(timeout):
+                self._read(key.data)
+        else:
+            time.sleep(timeout)
+        for node in self._nodes.values():
+            if node.reap():
+                self._read(node)
+                self._take_note(node)
+
+    def _read(self, node: NodeProcess) -> None:
+        if node.silent:
+            return
+        for line in node.lines():
+            node.log.write(line)
+            if line:
+                node.tail.append(line)
+            self._interpret(node, line)
+        if node.silent:
+            self._selector.unregister(node.pipe)
+
+    def _interpret(self, node: NodeProcess, line: str) -> None:
+        if line == f'ready: {node.name}':
+            node.ready = True
+            self._tell(Event('ready', node.name, line))
+        elif line == f'done: {node.name}':
+            node.done = True
+        elif line.startswith('phase: '):
+            self._tell(Event('phase', node.name, line.removeprefix('phase: ')))
+        elif is_warning(line):
+            node.warnings += 1
+            if node.warnings <= MOST_SHOWN:
+                more = '' if node.warnings < MOST_SHOWN else ' (further ones are in its log only)'
+                self._tell(Event('warning', node.name, line + more))
+
+    def _take_note(self, node: NodeProcess) -> None:
+        """Of the end of a process: a death, or as it was asked."""
+        status = node.process.returncode
+        if node.asked_to_end and status not in ASKED_FOR:
+            text = f'{node.name} did not end well ({describe(status)}), see its log'
+            self._tell(Event('warning', node.name, text))
+        if node.asked_to_end or (node.done and status == 0):
+            return
+        elapsed = None if self._began is None else time.monotonic() - self._began
+        death = Death(node.name, status, elapsed, tuple(node.tail))
+        self.outcome.deaths.append(death)
+        others = ', '.join(self.pids)
+        goes_on = f'; {others} go on' if others and elapsed is not None else ''
+        self._tell(Event('died', node.name, death.sentence + goes_on))
+
+    def _end(self, nodes: Iterable[NodeProcess], patience: int) -> None:
+        """Ends some nodes; more than `patience` interrupts are a hurry."""
+        remaining = [node for node in nodes if node.alive]
+        for node in remaining:
+            node.asked_to_end = True
+            node.send(signal.SIGINT)
+        asked = time.monotonic()
+        terminated: set[str] = set()
+        while remaining := [node for node in remaining if node.alive]:
+            waited = time.monotonic() - asked
+            for node in remaining:
+                grace = node.command.grace
+                hurry = self._interrupts > patience and not node.command.records
+                if hurry or waited > 1.5 * grace:
+                    self.outcome.killed.append(node.name)
+                    self._tell(Event('killed', node.name, f'{node.name} does not end: killed'))
+                    node.send_group(signal.SIGKILL)
+                    node.process.wait()
+                elif waited > grace and node.name not in terminated:
+                    terminated.add(node.name)
+                    node.send(signal.SIGTERM)
+            self._poll(POLL / 5)
+
+
+def describe(returncode: int) -> str:
+    """By which signal or exit status a process ended."""
+    if returncode < 0:
+        return f'killed by {signal.Signals(-returncode).name}'
+    return f'exit status {returncode}'
+
+
+def _unready(waiting: Sequence[NodeProcess], timeout: float) -> str:
+    said = '; '.join(
+        f'{node.name} said last: {" / ".join(node.tail) or "nothing"}' for node in waiting
+    )
+    names = ' and '.join(node.name for node in waiting)
+    return f'{names} not ready within {timeout:g} s; {said}'
