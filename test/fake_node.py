@@ -1,0 +1,57 @@
+"""A node without ROS for the tests of the supervisor: says its lines and writes down what it gets.
+
+Arguments: NAME, LEDGER (a file that all fake nodes append to), and any of: mute (never ready),
+deaf (ignores SIGINT and SIGTERM), done (says `done` soon), slow (ends 0.3 s after it was asked to),
+dies (exit status 7 before it is ready), refuses (the same with 2, as a node does whose scene is
+bad), falls (killed by a signal soon after it is ready), parent (starts a process of its own).
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+
+def main(name: str, ledger: str, *habits: str) -> None:
+    stopping = False
+
+    def note(word: str) -> None:
+        with Path(ledger).open('a') as file:
+            file.write(f'{word} {name} {os.getpid()} {time.monotonic()}\n')
+
+    def stop(number: int, _: object) -> None:
+        nonlocal stopping
+        note(signal.Signals(number).name)
+        stopping = 'deaf' not in habits
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    note('start')
+    if 'parent' in habits:
+        child = subprocess.Popen(['sleep', '600'])
+        with Path(ledger).open('a') as file:
+            file.write(f'start child {child.pid} 0\n')
+    if 'dies' in habits or 'refuses' in habits:
+        print('error: no such mesh', file=sys.stderr)
+        sys.exit(7 if 'dies' in habits else 2)
+    print(f'{name} looks around')
+    if 'mute' not in habits:
+        print(f'ready: {name}')
+    if 'done' in habits:
+        time.sleep(0.5)
+        print(f'done: {name}')
+    if 'falls' in habits:
+        time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGKILL)
+    print(f'[WARN] [1.0] [{name}]: careful')
+    while not stopping:
+        time.sleep(0.01)
+    if 'slow' in habits:
+        time.sleep(0.3)
+    note('end')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

@@ -1,0 +1,266 @@
+"""Sessions on the real graph: the launcher as a process, and what the bag has to say about it.
+
+Every process of a session carries the path of its scene in its command line, and each session has
+a scene file of its own: so are its processes found, and no others.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import WrenchStamped
+from rclpy.node import Node
+from ruamel.yaml import YAML
+
+from bags.reader import Recorded, open_bag
+from haptic_bridge.settings import HapticsSettings
+from haptic_bridge.wire import ForceSampleCodec, WrenchStampedCodec
+from session.domain import reserved_domain
+from session.graph import MODULES
+from tissue_sim.ros import NEWEST_BEST_EFFORT, polled, take_raw
+
+ROOT = Path(__file__).parents[1]
+PATIENCE = 60.0
+SERVO_CF, MEASURED_CF, MEASURED_CP = '/arm/servo_cf', '/arm/measured_cf', '/arm/measured_cp'
+CONTACT, TISSUE_FORCE = '/tool/contact', '/tissue/force'
+ABOVE, PRESSED, EASED = 0.0190, 0.0110, 0.0125
+"""Heights of the tip [m] over the block, of which the surface is at 10 mm and the radius 4 mm."""
+SPOT = (-0.012, -0.008)
+HAPTICS = HapticsSettings()
+FRAME = 1 / 30
+"""[s] between two frames of the tissue."""
+STEADY = 0.3
+"""[s] after which a force that stays counts as steady."""
+
+
+def phase(kind: str, *points: tuple[float, float, float, float], share: float = 1.0) -> Any:
+    """A phase of a script; points are x, y, z [m] and their share of the phase."""
+    waypoints = [{'position': list(point[:3]), 'share': point[3]} for point in points]
+    return {'kind': kind, 'share': share, 'waypoints': waypoints}
+
+
+def two_presses() -> list[Any]:
+    """Presses, eases, presses just as deep again, in seven seconds: the hands rests in both."""
+    press = [(*SPOT, PRESSED, 0.6), (*SPOT, PRESSED, 1.5)]
+    return [
+        phase('approach', (*SPOT, ABOVE, 1.0), share=1.0),
+        phase('palpate', *press, (*SPOT, EASED, 0.5), *press, share=4.7),
+        phase('retract', (*SPOT, ABOVE, 1.0), share=1.3),
+    ]
+
+
+def write_scene(folder: Path, phases: list[Any], seconds: float, cut_threshold: float) -> Path:
+    """A scene of the block of the thesis, of liver as stiff as it is in the body."""
+    source = ROOT / 'config' / 'scenes' / 'block.yaml'
+    scene = YAML(typ='safe').load(source)
+    tissue = scene['tissue']
+    tissue['mesh'] = str(ROOT / 'config' / 'meshes' / 'block_yi2007.msh')
+    tissue['material'] = {'preset': 'liver_elastography', 'toughness': 20, 'blade_friction': 5}
+    tissue['damping'] = {'alpha': 10, 'beta': 1e-3}
+    tissue['cut_threshold'] = cut_threshold
+    scene['arm']['script']['start']['position'] = [*SPOT, 0.030]
+    scene['arm']['script'] |= {'seconds': seconds, 'phases': phases}
+    scene['session']['seconds'] = seconds
+    # A shared machine may stand still for longer than the 20 ms that make a silent device a fault;
+    # that deadline has tests of its own (test_bridge_node.py).
+    scene['haptics'] = {**scene.get('haptics', {}), 'device_timeout': 0.2}
+    path = folder / 'scene.yaml'
+    with path.open('w') as file:
+        YAML().dump(scene, file)
+    return path
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    """Waits for a condition to be true, and returns it."""
+    deadline = time.monotonic() + PATIENCE
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f'waited in vain for {what}'
+        time.sleep(0.01)
+    return value
+
+
+def free_domain() -> int:
+    """A ROS domain that nobody uses."""
+    with reserved_domain('free') as domain:
+        return domain
+
+
+@contextmanager
+def onlooker(domain: int) -> Iterator[Any]:
+    """A subscription to the commanded force in this process, to be polled."""
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = Node('onlooker', context=context)
+    try:
+        yield polled(node, WrenchStamped, SERVO_CF, NEWEST_BEST_EFFORT)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+class LiveSession:
+    """`trainer demo` as its own process.
+
+    Args:
+        folder: for the bag and what the launcher says.
+        scene: file of its own.
+        domain: ROS domain.
+    """
+
+    def __init__(self, folder: Path, scene: Path, domain: int) -> None:
+        self.bag = folder / 'bag'
+        self._domain = domain
+        self.scene = scene
+        self._said = folder / 'said'
+        command = [sys.executable, '-m', 'session.cli', 'demo', '--domain', str(domain)]
+        with self._said.open('wb') as file:
+            self.launcher = subprocess.Popen(
+                [*command, '--scene', str(scene), '--bag', str(self.bag)],
+                cwd=ROOT,
+                env=os.environ | {'COLUMNS': '200'},
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def said(self) -> str:
+        """Everything that the launcher has printed."""
+        return self._said.read_text()
+
+    def running(self) -> dict[str, int]:
+        """Process ids of the session by node; `launcher` for the command itself."""
+        found = {}
+        for entry in Path('/proc').iterdir():
+            try:
+                words = (entry / 'cmdline').read_bytes().decode().split('\0')
+                state = (entry / 'stat').read_text().rpartition(')')[2].split()[0]
+            except (OSError, UnicodeDecodeError):
+                continue
+            if state != 'Z' and any(str(self.scene) in word for word in words):
+                names = [name for name, module in MODULES.items() if module in words]
+                found[names[0] if names else 'launcher'] = int(entry.name)
+        return found
+
+    def wait_until_said(self, text: str) -> None:
+        """Returns when the launcher has printed this."""
+        wait_for(lambda: text in self.said or self.launcher.poll() is not None, text)
+        assert text in self.said, self.said
+
+    def wait_until_pressed(self, least: float) -> None:
+        """Returns when the force on the hand [N] has stayed above a value for a while."""
+        rest = -np.inf
+        with onlooker(self._domain) as forces:
+
+            def pressed() -> bool:
+                nonlocal rest
+                assert self.launcher.poll() is None, self.said
+                raw, now = take_raw(forces), time.monotonic()
+                felt = raw and np.linalg.norm(WrenchStampedCodec().decode(raw).values[:3])
+                if felt is not None and felt < least:
+                    rest = now
+                return felt is not None and now - rest > STEADY
+
+            wait_for(lambda: take_raw(forces), 'the first force')
+            rest = time.monotonic()
+            wait_for(pressed, 'the hand to press')
+
+    def interrupt(self) -> None:
+        """What Ctrl-C does."""
+        os.kill(self.launcher.pid, signal.SIGINT)
+
+    def kill(self, node: str) -> int:
+        """Kills a node; returns when, [ns] since the epoch."""
+        process = self.running()[node]
+        now = time.time_ns()
+        os.kill(process, signal.SIGKILL)
+        return now
+
+    def end(self) -> int:
+        """Waits for the launcher's end; returns its exit status."""
+        return self.launcher.wait(PATIENCE)
+
+    def clean(self) -> None:
+        """Kills what is left over."""
+        for process in self.running().values():
+            os.kill(process, signal.SIGKILL)
+        self.launcher.wait(PATIENCE)
+
+
+class Recording:
+    """A bag in memory. Times are [s] by the stamp in the header, since the first message.
+
+    Attributes:
+        complete: whether the bag was closed in order.
+        start: when the first message was recorded [ns since the epoch].
+    """
+
+    def __init__(self, folder: Path) -> None:
+        bag = open_bag(folder)
+        self.complete = bag.complete
+        self._messages: dict[str, list[Recorded]] = {topic: [] for topic in bag.topics()}
+        self.start = 0
+        for message in bag.messages():
+            self.start = self.start or message.log_time
+            self._messages[message.topic].append(message)
+
+    def at(self, nanoseconds: int) -> float:
+        """A time of the system clock as one of this recording [s]."""
+        return (nanoseconds - self.start) * 1e-9
+
+    def messages(self, topic: str) -> list[Recorded]:
+        """All of a topic, in the order of their arrival."""
+        return self._messages.get(topic, [])
+
+    def read(self, topic: str, codec: Any, *fields: str) -> tuple[np.ndarray, ...]:
+        """Times [s], shape (n,), and each field, shape (n, count)."""
+        samples = [codec.decode(message.data) for message in self.messages(topic)]
+        times = np.array([self.at(sample.stamp_ns) for sample in samples])
+        values = [np.array([s.values[codec.fields[name]] for s in samples]) for name in fields]
+        return times, *values
+
+    def force(self, topic: str) -> tuple[np.ndarray, np.ndarray]:
+        """Times [s] and norm of the force [N], shape (n,)."""
+        times, forces = self.read(topic, WrenchStampedCodec(), 'force')
+        return times, np.linalg.norm(forces, axis=1)
+
+
+def zero_from(times: np.ndarray, norms: np.ndarray) -> float:
+    """Since when [s] the force has been zero to the end; infinite if it is not."""
+    nonzero = np.flatnonzero(norms)
+    last = nonzero[-1] + 1 if len(nonzero) else 0
+    return float(times[last]) if last < len(times) else np.inf
+
+
+def worst_gap(times: np.ndarray, start: float, end: float) -> float:
+    """The longest time [s] between two samples of an interval, which the scheduler made of 1 ms."""
+    return float(np.diff(times[(times > start) & (times < end)]).max())
+
+
+def held_up(recording: Recording, times: np.ndarray) -> np.ndarray:
+    """When, of the times [s], the force was low because the tissue's process had no turn.
+
+    The force fades while frames are overdue, and is let in softly after that.
+    """
+    frames, _ = recording.read(TISSUE_FORCE, ForceSampleCodec(), 'step')
+    late = np.flatnonzero(np.diff(frames) > HAPTICS.stale_after - FRAME)
+    held = np.zeros(len(times), bool)
+    for gap in late:
+        end = frames[gap + 1] + HAPTICS.soft_start + 2 * FRAME
+        held |= (times > frames[gap] + HAPTICS.stale_after - FRAME) & (times < end)
+    return held
+
+
+def deaths(said: str) -> list[str]:
+    """Who died, in the words of the launcher."""
+    return re.findall(r'^(\w+) died after [\d.]+ s \(killed by SIGKILL\); .* go on$', said, re.M)

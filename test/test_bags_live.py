@@ -1,0 +1,307 @@
+"""The recorder on a real graph: what was published is in the bag, byte for byte."""
+
+import itertools
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from cutting_trainer_msgs.msg import Contact, MeshDelta
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
+from rclpy.serialization import serialize_message
+from rclpy.service_introspection import ServiceIntrospectionState
+from rosbags.highlevel import AnyReader
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+
+from bags.decode import decode
+from bags.reader import open_bag
+from tissue_sim.ros import CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
+
+ROOT = Path(__file__).parents[1]
+DOMAIN = 20 + os.getpid() % 80
+PATIENCE = 20.0
+
+
+def wait_for(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, f'waited in vain for {what}'
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def node() -> Iterator[Node]:
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    node = Node('source', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    stop = threading.Event()
+
+    def spin() -> None:
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.05)
+
+    spinner = threading.Thread(target=spin)
+    spinner.start()
+    yield node
+    stop.set()
+    spinner.join()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+class RecorderProcess:
+    """A recorder of its own process, ready to hear."""
+
+    def __init__(self, folder: Path, **parameters: object) -> None:
+        self.folder = folder
+        settings = [f'{key}:={value}' for key, value in ({'bag': folder} | parameters).items()]
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', 'bags.node', '--ros-args']
+            + [word for setting in settings for word in ('-p', setting)],
+            cwd=ROOT,
+            env=os.environ | {'ROS_DOMAIN_ID': str(DOMAIN), 'PYTHONUNBUFFERED': '1'},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == 'ready: recorder\n'
+
+    def end(self, number: int = signal.SIGINT) -> str:
+        """Sends a signal; returns what the recorder said after it was ready."""
+        self.process.send_signal(number)
+        said, _ = self.process.communicate(timeout=PATIENCE)
+        return said
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[RecorderProcess]:
+    (tmp_path / 'scene.yaml').write_text('name: block\n')
+    recorder = RecorderProcess(tmp_path / 'bag', scene=tmp_path / 'scene.yaml', seed=11)
+    yield recorder
+    if recorder.process.poll() is None:
+        recorder.process.kill()
+        recorder.process.wait()
+
+
+def heard(node: Node, message_type: Any, topic: str, qos: QoSProfile) -> Any:
+    """A publisher that the recorder has subscribed to."""
+    publisher = node.create_publisher(message_type, topic, qos)
+    wait_for(lambda: publisher.get_subscription_count() == 1, f'the recorder to hear {topic}')
+    return publisher
+
+
+def poses(count: int) -> Iterator[bytes]:
+    source = random.Random(5)
+    for i in range(count):
+        pose = PoseStamped()
+        pose.header.frame_id = f'device {i}'
+        pose.pose.position.x = source.random()
+        yield serialize_message(pose)
+
+
+def publish_at_1_khz(publisher: Any, messages: Iterator[bytes]) -> list[bytes]:
+    sent = []
+    deadline = time.monotonic()
+    for data in messages:
+        publisher.publish(data)
+        sent.append(data)
+        deadline += 0.001
+        time.sleep(max(0.0, deadline - time.monotonic()))
+    return sent
+
+
+def recorded(folder: Path, topic: str) -> list[bytes]:
+    with AnyReader([folder]) as reader:
+        chosen = [c for c in reader.connections if c.topic == topic]
+        return [bytes(data) for _, _, data in reader.messages(chosen)]
+
+
+def test_every_message_of_a_1_khz_stream_is_in_the_bag_byte_for_byte(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    publisher = heard(node, PoseStamped, '/stream', QoSProfile(depth=1000))
+    sent = publish_at_1_khz(publisher, poses(2000))
+    time.sleep(0.3)
+    said = recorder.end()
+    assert recorder.process.returncode == 0
+    assert re.fullmatch(rf'recorded: \d+ messages, \d+ topics, 0 lost, {recorder.folder}\n', said)
+    assert recorded(recorder.folder, '/stream') == sent
+    bag = open_bag(recorder.folder)
+    assert bag.complete
+    assert bag.custom_data['scene'] == 'name: block\n'
+    assert bag.custom_data['seed'] == '11'
+    times = [(m.log_time, m.publish_time) for m in bag.messages(['/stream'])]
+    assert all(0 < log - published < 1e9 for log, published in times)
+
+
+def test_a_stream_that_keeps_only_the_newest_is_in_the_bag_or_counted_as_lost(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    publisher = heard(node, PoseStamped, '/stream', STREAM)
+    sent = publish_at_1_khz(publisher, poses(2000))
+    time.sleep(0.3)
+    said = recorder.end(signal.SIGTERM)
+    assert recorder.process.returncode == 0
+    lost = int(re.search(r'(\d+) lost', said)[1])
+    got = recorded(recorder.folder, '/stream')
+    assert got[-1] == sent[-1]
+    assert len(got) + lost == len(sent)
+    assert set(got) <= set(sent)
+
+
+def test_our_own_messages_are_understood_from_the_bag_alone(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    updates = heard(node, MeshDelta, MESH_UPDATES, UPDATES)
+    contacts = heard(node, Contact, CONTACT, STREAM)
+    displacement = [random.Random(2).random() for _ in range(17_500)]
+    updates.publish(MeshDelta(revision=8, base_revision=7, displacement=displacement))
+    contacts.publish(Contact(state=Contact.TOUCHING, nodes=[1, 2, 3, 0, 0, 0, 0, 0, 0]))
+    time.sleep(0.3)
+    recorder.end()
+    with AnyReader([recorder.folder]) as reader:
+        by_topic = {
+            c.topic: reader.deserialize(data, c.msgtype) for c, _, data in reader.messages()
+        }
+    delta = by_topic['/tissue/mesh_updates']
+    assert (delta.revision, delta.base_revision) == (8, 7)
+    assert list(delta.displacement) == displacement
+    assert list(by_topic['/tool/contact'].nodes) == [1, 2, 3] + [0] * 6
+
+
+def test_a_latched_message_from_before_the_recorder_is_in_the_bag(
+    node: Node, tmp_path: Path
+) -> None:
+    publisher = node.create_publisher(String, '/latched', LATCHED)
+    publisher.publish(String(data='from before'))
+    recorder = RecorderProcess(tmp_path / 'bag')
+    wait_for(lambda: publisher.get_subscription_count() == 1, 'the recorder')
+    time.sleep(0.5)
+    recorder.end()
+    (message,) = open_bag(recorder.folder).messages(['/latched'])
+    assert decode(message).data == 'from before'
+
+
+def test_a_best_effort_publisher_is_recorded_with_the_qos_it_offers(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = heard(node, String, '/casual', qos)
+    publisher.publish(String(data='hello'))
+    time.sleep(0.3)
+    recorder.end()
+    with AnyReader([recorder.folder]) as reader:
+        (connection,) = [c for c in reader.connections if c.topic == '/casual']
+        assert connection.ext.offered_qos_profiles[0].reliability.name == 'BEST_EFFORT'
+        assert connection.ext.offered_qos_profiles[0].history.name == 'KEEP_LAST'
+        assert connection.msgcount == 1
+
+
+def test_service_calls_are_recorded_where_introspection_is_on(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    def answer(request: Any, response: Any) -> Any:
+        response.success, response.message = request.data, 'cut'
+        return response
+
+    service = node.create_service(SetBool, '/do_it', answer)
+    service.configure_introspection(
+        node.get_clock(), qos_profile_system_default, ServiceIntrospectionState.CONTENTS
+    )
+    wait_for(lambda: node.count_subscribers('/do_it/_service_event') == 1, 'the recorder')
+    client = node.create_client(SetBool, '/do_it')
+    assert client.wait_for_service(PATIENCE)
+    future = client.call_async(SetBool.Request(data=True))
+    wait_for(future.done, 'the service')
+    time.sleep(0.3)
+    recorder.end()
+    events = [decode(m) for m in open_bag(recorder.folder).messages(['/do_it/_service_event'])]
+    assert [list(event.request) for event in events if event.request] == [
+        [SetBool.Request(data=True)]
+    ]
+    assert [event.response[0].message for event in events if event.response] == ['cut']
+    assert len(recorded(recorder.folder, '/do_it/_service_event')) == len(events) == 2
+
+
+def test_a_killed_recorder_leaves_all_but_the_last_half_second(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    publisher = heard(node, PoseStamped, '/stream', QoSProfile(depth=1000))
+    sent = publish_at_1_khz(publisher, poses(1500))
+    recorder.process.kill()
+    recorder.process.wait()
+    killed = time.time_ns()
+    bag = open_bag(recorder.folder)
+    assert not bag.complete
+    assert bag.custom_data['seed'] == '11'
+    got = list(bag.messages(['/stream']))
+    assert [m.data for m in got] == sent[: len(got)]
+    assert killed - got[-1].log_time < 5e8
+
+
+def test_what_a_publisher_sent_before_the_recorder_heard_it_is_said(
+    node: Node, tmp_path: Path
+) -> None:
+    publisher = node.create_publisher(String, '/early', QoSProfile(depth=10))
+    for i in range(3):
+        publisher.publish(String(data=str(i)))
+    recorder = RecorderProcess(tmp_path / 'bag')
+    wait_for(lambda: publisher.get_subscription_count() == 1, 'the recorder')
+    time.sleep(0.2)
+    publisher.publish(String(data='heard'))
+    time.sleep(0.3)
+    assert 'not heard: the first 3 of /early' in recorder.end()
+
+
+def test_losses_are_on_diagnostics_and_diagnostics_are_in_the_bag(
+    recorder: RecorderProcess,
+) -> None:
+    time.sleep(2.5)
+    recorder.end()
+    arrays = [decode(m) for m in open_bag(recorder.folder).messages(['/diagnostics'])]
+    status = arrays[-1].status[0]
+    values = {pair.key: pair.value for pair in status.values}
+    assert status.name == 'recorder'
+    assert int(values['received']) >= int(values['written']) > 0
+    assert values['lost'] == '0'
+    assert int(values['bytes']) > 0
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'complaint'),
+    [
+        ({'bag': '.'}, 'exists already'),
+        ({'bag': ''}, 'parameter "bag" is missing'),
+        ({'bag': 'new', 'scene': 'nowhere.yaml'}, 'cannot read the scene'),
+    ],
+)
+def test_a_recorder_that_cannot_work_says_why_and_ends(
+    tmp_path: Path, parameters: dict[str, str], complaint: str
+) -> None:
+    words = [('-p', f'{key}:={value or repr(value)}') for key, value in parameters.items()]
+    ended = subprocess.run(
+        [sys.executable, '-m', 'bags.node', '--ros-args', *itertools.chain(*words)],
+        cwd=tmp_path,
+        env=os.environ | {'PYTHONPATH': f'{ROOT}{os.pathsep}{os.environ.get("PYTHONPATH", "")}'},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.startswith('error: ') and complaint in ended.stderr
+    assert not (tmp_path / 'new').exists()

@@ -1,0 +1,189 @@
+"""The blade in the tissue: what it costs to move it, and that tension opens what it has cut."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from meshes import box
+
+from tissue_sim.blade import Resistance
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh
+from tissue_sim.simulation import Command, Frame, State, TissueSimulation, ToolContact
+
+TOUGHNESS, RATE = 40.0, 500.0
+
+
+def block(stretch: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TissueSimulation:
+    nodes, tets = box((12, 6, 4), 0.005)
+    return TissueSimulation(
+        TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
+        Material(5000.0, 0.4, 1000.0, 5.0, 1e-3),
+        Resistance(0.05, TOUGHNESS, 0.0),
+        rate=RATE,
+        stretch=stretch,
+    )
+
+
+def contact_at(simulation: TissueSimulation, tip: np.ndarray) -> ToolContact:
+    """A tip over, at or under a place of the flat top, as the bridge would report it."""
+    mesh, at = simulation.mesh, np.array([*tip[:2], 0.02])
+    corners = mesh.rest[mesh.triangles]
+    edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
+    flat = np.flatnonzero((corners[:, :, 2] > 0.0199).all(axis=1))
+    shares = [np.linalg.lstsq(edges[k], at - corners[k, 0], rcond=None)[0] for k in flat]
+    weights = np.array([[1 - a - b, a, b] for a, b in shares])
+    best = int(np.argmax(weights.min(axis=1)))
+    return ToolContact(
+        state=State.TOUCHING if tip[2] < 0.02 else State.NONE,
+        topology=mesh.topology,
+        nodes=mesh.triangles[flat[best]].astype(np.int64),
+        weights=np.clip(weights[best], 0, 1) / np.clip(weights[best], 0, 1).sum(),
+        device=tip + np.array([0, 0, 0.001]),
+        offset=np.array([0, 0, 0.001]),
+        normal=np.array([0.0, 0, 1]),
+        stiffness=400.0,
+        radius=0.001,
+        blade_root=tip + np.array([0, 0, 0.03]),
+        blade_tip=tip,
+    )
+
+
+def draw(simulation: TissueSimulation, tips: np.ndarray) -> Iterator[Frame]:
+    """Draws a vertical blade of 3 cm along a path of its tip; yields the frames."""
+    for tip in tips:
+        yield simulation.frame(contact_at(simulation, tip))
+
+
+def path(*corners: tuple[float, float, float], speed: float = 0.04) -> np.ndarray:
+    points = [np.array([corners[0]])]
+    for a, b in itertools.pairwise(corners):
+        steps = int(np.linalg.norm(np.subtract(b, a)) / speed * RATE)
+        points.append(np.linspace(a, b, steps + 1)[1:])
+    return np.concatenate(points)
+
+
+def test_the_blade_moves_on_only_at_toughness_times_immersed_length() -> None:
+    simulation = block()
+    tips = path((0.012, 0.015, 0.021), (0.012, 0.015, 0.01), (0.05, 0.015, 0.01))
+    forces, limits = [], []
+    for frame in draw(simulation, tips):
+        if frame.command == Command.ADVANCE:
+            simulation.cut_done()
+        forces.append(np.linalg.norm(frame.force))
+        limits.append(frame.resistance)
+    assert simulation.state == State.INSIDE
+    # 10 mm deep at 40 J/m^2: 0.4 N, and it never pulls harder than that.
+    assert np.median(limits[-200:]) == pytest.approx(TOUGHNESS * 0.010, rel=0.1)
+    assert np.median(forces[-200:]) == pytest.approx(np.median(limits[-200:]), rel=0.05)
+
+
+def test_the_area_that_is_asked_for_is_the_area_that_is_swept_and_sweeps_join() -> None:
+    simulation = block()
+    tips = path((0.012, 0.015, 0.021), (0.012, 0.015, 0.01), (0.045, 0.015, 0.01))
+    sweeps = []
+    steps = []
+    for frame in draw(simulation, tips):
+        if frame.command == Command.ADVANCE:
+            steps.append(frame.step)
+            sweeps.append(frame.sweep)
+            simulation.cut_done()
+    start = sweeps[0].tip_from[0]
+    swept = sweeps[-1].tip_to[0] - start
+    inside = sum(s.area for s in sweeps[5:]) * 0.01 / 0.03
+    assert inside == pytest.approx(swept * 0.01, rel=0.15)
+    joints = [
+        np.linalg.norm(sweeps[i].tip_to - sweeps[i + 1].tip_from)
+        for i in range(20, len(sweeps) - 1)
+        if steps[i + 1] == steps[i] + 1
+    ]
+    assert len(joints) > 100
+    # From frame to frame the tissue carries the cut's end along, a little.
+    assert max(joints) < 1e-4
+
+
+def test_a_blade_that_is_lifted_out_is_let_go_and_the_cut_is_finished_once() -> None:
+    simulation = block()
+    tips = path(
+        (0.02, 0.015, 0.021), (0.02, 0.015, 0.012), (0.03, 0.015, 0.012), (0.03, 0.015, 0.04)
+    )
+    commands = []
+    for frame in draw(simulation, tips):
+        if frame.command is not None:
+            commands.append(frame.command)
+            simulation.cut_done()
+    assert commands.count(Command.FINISH) == 1
+    assert commands[-1] == Command.FINISH
+    assert simulation.state == State.NONE
+
+
+def test_a_sweep_that_was_not_cut_is_asked_for_again() -> None:
+    simulation = block()
+    tips = path((0.012, 0.015, 0.021), (0.012, 0.015, 0.01), (0.04, 0.015, 0.01))
+    sweeps = []
+    for frame in draw(simulation, tips):
+        if frame.command == Command.ADVANCE:
+            sweeps.append(frame.sweep)
+            simulation.cut_failed()
+    # The tissue, and where the cut begins in it, follow the blade by a few millimetres.
+    assert all(np.linalg.norm(s.tip_from - sweeps[0].tip_from) < 8e-3 for s in sweeps)
+    assert sweeps[-1].area > 5 * sweeps[0].area
+
+
+def test_below_the_threshold_the_blade_does_not_go_in() -> None:
+    simulation = block()
+    for frame in draw(simulation, path((0.02, 0.015, 0.021), (0.02, 0.015, 0.0199), speed=0.01)):
+        assert frame.command is None
+    assert simulation.state == State.TOUCHING
+
+
+def test_stretch_puts_the_tissue_in_tension_and_in_equilibrium() -> None:
+    simulation = block((0.0, 0.05, 0.0))
+    u = simulation.displacement
+    fixed = simulation.mesh.fixed == 1
+    expected = (simulation.mesh.rest[fixed] - simulation.mesh.rest[fixed].mean(axis=0)) * [
+        0,
+        0.05,
+        0,
+    ]
+    np.testing.assert_allclose(u[fixed], expected, atol=1e-15)
+    force = simulation.model.force(u)
+    assert np.abs(force[~fixed]).max() < 1e-9 * np.abs(force).max()
+    before = u.copy()
+    frame = simulation.frame(None)
+    assert frame.kinetic_energy < 1e-12 * frame.elastic_energy
+    np.testing.assert_allclose(simulation.displacement, before, atol=1e-9)
+
+
+def test_a_bridge_that_is_disabled_in_the_cut_makes_the_tissue_let_go_and_finish() -> None:
+    simulation = block()
+    tips = path((0.012, 0.015, 0.021), (0.012, 0.015, 0.01), (0.03, 0.015, 0.01))
+    for frame in draw(simulation, tips):
+        if frame.command is not None:
+            simulation.cut_done()
+    assert simulation.state == State.INSIDE
+    silent = replace(contact_at(simulation, tips[-1]), state=State.NONE)
+    frame = simulation.frame(silent)
+    assert simulation.state == State.NONE
+    assert frame.command == Command.FINISH
+    simulation.cut_done()
+    assert not simulation.frame(silent).force.any()
+
+
+def test_a_frame_that_diverges_is_taken_back_and_the_tool_is_let_go() -> None:
+    simulation = block()
+    for _ in draw(simulation, path((0.012, 0.015, 0.021), (0.012, 0.015, 0.0195))):
+        pass
+    before = simulation.displacement.copy()
+    assert before.any()
+    simulation.velocity[:] = 1e6
+    frame = simulation.frame(contact_at(simulation, np.array([0.012, 0.015, 0.0195])))
+    assert frame.diverged
+    assert not frame.force.any()
+    assert np.array_equal(simulation.displacement, before)
+    assert not simulation.velocity.any()
+    after = [simulation.frame(None) for _ in range(50)]
+    assert not any(f.diverged for f in after)
+    assert after[-1].elastic_energy < after[0].elastic_energy

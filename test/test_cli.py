@@ -1,0 +1,178 @@
+"""The command line: every command explains itself, and every mistake is one line."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from session import cli
+from session.checks import Check, all_checks, run_checks, verdict
+from session.scene import SCENES, find_scene, load_scene
+from session.status import Status
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def trainer(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(list(arguments))
+    return int(stopped.value.code or 0)
+
+
+def test_help_shows_each_command_with_one_line_and_the_exit_statuses(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert trainer('--help') == 0
+    text = capsys.readouterr().out
+    assert re.search(r'demo +Run a session', text)
+    assert re.search(r'test +Run all checks', text)
+    for status in Status:
+        assert status.meaning.split()[0] in text and str(int(status)) in text
+
+
+@pytest.mark.parametrize(
+    'arguments', [('dmeo',), ('demo', '--sceen', 'liver'), ('demo', '--seed', 'x')]
+)
+def test_misspelt_command_option_or_number_is_bad_input(arguments: tuple[str, ...]) -> None:
+    assert trainer(*arguments) == Status.BAD_INPUT
+
+
+def one_error_line(capsys: pytest.CaptureFixture[str]) -> str:
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith('error: '), captured.err
+    return lines[0]
+
+
+def test_unknown_scene_names_the_near_match_and_all_there_are(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    known = sorted(path.stem for path in SCENES.glob('*.yaml'))
+    assert trainer('demo', '--scene', known[0] + 'x') == Status.BAD_INPUT
+    line = one_error_line(capsys)
+    assert f'did you mean {known[0]}?' in line
+    assert ', '.join(known) in line
+
+
+def test_scene_file_that_is_not_there_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert trainer('demo', '--scene', str(tmp_path / 'mine.yaml')) == Status.BAD_INPUT
+    assert f'{tmp_path / "mine.yaml"} does not exist' in one_error_line(capsys)
+
+
+def test_mistake_in_a_scene_is_told_with_its_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    text = find_scene('liver').read_text().replace('../meshes', str(SCENES.parent / 'meshes'))
+    scene = tmp_path / 'mine.yaml'
+    scene.write_text(re.sub(r'^session:.*?(?=^\S|\Z)', '', text, flags=re.M | re.S))
+    with scene.open('a') as file:
+        file.write('\nsession:\n  secnds: 5\n')
+    assert trainer('demo', '--scene', str(scene)) == Status.BAD_INPUT
+    line = one_error_line(capsys)
+    assert str(scene) in line and 'did you mean seconds?' in line
+
+
+def test_bag_folder_that_exists_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert trainer('demo', '--bag', str(tmp_path)) == Status.BAD_INPUT
+    assert f'{tmp_path} exists already' in one_error_line(capsys)
+
+
+def test_bag_in_a_folder_that_is_not_there_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert trainer('demo', '--bag', str(tmp_path / 'no' / 'bag')) == Status.BAD_INPUT
+    assert f'{tmp_path / "no"} does not exist' in one_error_line(capsys)
+
+
+@pytest.mark.parametrize('seconds', ['0', '-3', 'nan', 'inf', '1e9'])
+def test_duration_that_cannot_be_is_refused(
+    capsys: pytest.CaptureFixture[str], seconds: str
+) -> None:
+    assert trainer('demo', '--seconds', seconds) == Status.BAD_INPUT
+    assert 'from 5 to 86400' in one_error_line(capsys)
+
+
+def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stumble(options: object) -> Status:
+        raise ValueError('a bug')
+
+    monkeypatch.setattr('session.demo.run_demo', stumble)
+    with pytest.raises(ValueError, match='a bug'):
+        cli.main(['demo'])
+
+
+def test_interrupt_outside_a_session_has_the_status_of_an_interrupt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(options: object) -> Status:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr('session.demo.run_demo', interrupted)
+    assert trainer('demo') == Status.INTERRUPTED
+
+
+def test_start_of_the_command_line_does_not_load_the_core() -> None:
+    code = 'import session.cli, sys; print(*sys.modules)'
+    loaded = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert not {'numpy', 'numba', 'rclpy', 'pydantic'} & set(loaded)
+
+
+@pytest.mark.parametrize('name', sorted(path.stem for path in SCENES.glob('*.yaml')))
+def test_every_shipped_scene_is_valid(name: str) -> None:
+    scene = load_scene(name)
+    assert scene.name == name
+    assert scene.tissue.mesh.is_file()
+
+
+def python(code: str) -> tuple[str, ...]:
+    return (sys.executable, '-c', code)
+
+
+def test_test_command_runs_every_check_and_has_the_status_of_the_first_that_failed(
+    tmp_path: Path,
+) -> None:
+    checks = [
+        Check('lint', python('pass')),
+        Check('types', python('raise SystemExit(7)')),
+        Check('tests', python('raise SystemExit(5)')),
+    ]
+    announced: list[str] = []
+    results = run_checks(checks, tmp_path, announced.append)
+    assert announced == ['lint', 'types', 'tests']
+    assert verdict(results) == (7, 'failed: types, tests')
+    assert verdict({'lint': 0, 'tests': 0}) == (0, 'all passed: lint, tests')
+
+
+def test_extra_arguments_of_the_test_command_reach_pytest() -> None:
+    checks = all_checks(['-k', 'patch', '--maxfail=1'])
+    assert [check.name for check in checks] == ['ruff check', 'ruff format', 'mypy', 'pytest']
+    assert checks[-1].argv[1:] == ('-m', 'pytest', '-k', 'patch', '--maxfail=1')
+
+
+def test_nodes_get_their_parameters_quoted_and_one_environment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from session.graph import node_environment, session_nodes
+
+    nodes = session_nodes(Path('/a b/c: d.yaml'), Path('/bags/x'), 3, 12)
+    assert [node.name for node in nodes][-1] == 'recorder' and nodes[-1].records
+    for node in nodes:
+        assert 'scene:="/a b/c: d.yaml"' in node.argv
+    given = [json.loads(a.partition(':=')[2]) for a in nodes[0].argv if a.startswith('seconds:=')]
+    assert given == [12.0] and isinstance(given[0], float)
+    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
+    environment = node_environment(5)
+    assert environment['ROS_DOMAIN_ID'] == '5'
+    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    assert environment['PYTHONPATH'].split(os.pathsep)[0] == str(ROOT)

@@ -1,0 +1,86 @@
+"""The work of the blade is what the tissue stores, moves and dissipates, and its fracture costs."""
+
+import numpy as np
+import pytest
+from meshes import irregular_box
+from test_blade import contact_at, path
+
+from cutting.methods import make_method
+from cutting.settings import CuttingSettings
+from tissue_sim.blade import Resistance
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh
+from tissue_sim.simulation import Command, Frame, TissueSimulation
+from tissue_sim.topology import CUT
+
+TOUGHNESS, RATE = 40.0, 500.0
+MATERIAL = Material(30000.0, 0.4, 1000.0, 5.0, 2e-4)
+
+
+def cut_area(mesh: TetMesh) -> float:
+    """Area of one side of the cut [m^2], rest configuration."""
+    corners = mesh.rest[mesh.triangles[mesh.triangle_kind == CUT]]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(np.linalg.norm(sides, axis=1).sum() / 4)
+
+
+class Stroke:
+    """A blade drawn through a block, cut one frame late as in the graph, with its accounts."""
+
+    def __init__(self, simulation: TissueSimulation) -> None:
+        self.simulation = simulation
+        self.method = make_method(CuttingSettings())
+        self.work = self.dissipated = 0.0
+        self._asked: tuple[Frame, np.ndarray] | None = None
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+
+    def step(self, tip: np.ndarray) -> Frame:
+        simulation = self.simulation
+        if self._asked is not None:
+            frame, positions = self._asked
+            if frame.command == Command.ADVANCE:
+                self._apply(self.method.advance(simulation.mesh, positions, frame.sweep))
+            else:
+                self._apply(self.method.finish(simulation.mesh, positions))
+        frame = simulation.frame(contact_at(simulation, tip))
+        self._asked = (frame, simulation.positions) if frame.command is not None else None
+        if self._last is not None:
+            self.work -= 0.5 * (frame.force + self._last[0]) @ (tip - self._last[1])
+        self._last = (frame.force, tip)
+        v, c = simulation.velocity, simulation.material
+        viscous = c.beta * np.sum(v * simulation.model.force(v))
+        inertial = c.alpha * simulation.model.mass @ np.square(v).sum(axis=1)
+        self.dissipated += (viscous + inertial) / RATE
+        return frame
+
+    def _apply(self, result) -> None:
+        if result.delta.empty:
+            self.simulation.cut_done()
+        else:
+            self.simulation.apply_cut(result.delta)
+
+    def finish(self) -> None:
+        self._apply(self.method.finish(self.simulation.mesh, self.simulation.positions))
+
+
+def test_the_work_of_the_blade_is_accounted_for_within_five_per_cent() -> None:
+    nodes, tets = irregular_box((24, 10, 8), 0.0025, 3, jitter=0.1)
+    stroke = Stroke(
+        TissueSimulation(
+            TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
+            MATERIAL,
+            Resistance(0.05, TOUGHNESS, 0.0),
+            rate=RATE,
+            max_substeps=1000,
+        )
+    )
+    stops = ((0.010, 0.0138, 0.0205), (0.010, 0.0138, 0.0112), (0.035, 0.0138, 0.0112))
+    for tip in path(*stops):
+        frame = stroke.step(tip)
+    stroke.finish()
+    area = cut_area(stroke.simulation.mesh)
+    assert area > 1.8e-4
+    stored = frame.kinetic_energy + frame.elastic_energy
+    spent = TOUGHNESS * area + stroke.dissipated + stored
+    print(f'work {stroke.work:.3e} J, fracture {TOUGHNESS * area:.3e} J, stored {stored:.3e} J')
+    assert stroke.work == pytest.approx(spent, rel=0.05)

@@ -1,0 +1,157 @@
+"""Claims about the laws that turn 30 Hz samples of the tissue's force into a force at 1 kHz."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from haptic_bridge import extrapolation as ex
+
+FRAME = 1 / 30
+STIFF = 1e9
+
+
+def ns(seconds):
+    return round(seconds * 1e9)
+
+
+def time_law(t, samples):
+    (t0, f0), (t1, f1) = samples
+    out = np.zeros(3)
+    forces = np.array([[f0, 0, 0], [f1, 0, 0]], float)
+    ex.time_linear(ns(t), np.array([ns(t0), ns(t1)]), forces, out)
+    return out[0]
+
+
+def position_law(p, samples, max_stiffness=STIFF):
+    (p0, f0), (p1, f1) = samples
+    out = np.zeros(3)
+    ex.position_linear(
+        np.array(p, float), np.array([p0, p1], float), np.array([f0, f1], float), max_stiffness, out
+    )
+    return out
+
+
+def history(*samples, topology=1, state=1):
+    h = np.zeros(1, ex.HISTORY)
+    for time, position, force in samples:
+        ex.push(h, ns(time), position, force, np.zeros((3, 3)), topology=topology, state=state)
+    return h
+
+
+def test_constant_law_is_the_last_force():
+    out = np.zeros(3)
+    ex.constant(np.array([1.0, -2.0, 3.0]), out)
+    np.testing.assert_array_equal(out, [1, -2, 3])
+
+
+def test_time_law_is_exact_for_a_force_linear_in_time():
+    assert time_law(0.05, [(0.0, 0.0), (FRAME, FRAME)]) == pytest.approx(0.05, rel=1e-6)
+
+
+def test_time_law_overshoots_a_reversal_by_twice_what_holding_errs():
+    """A wave of rate r that turns at t_i: after a frame T it errs by 2 r T, holding by r T."""
+    rate, peak = 1.0, 0.5
+    true = peak - rate * FRAME
+    linear = time_law(2 * FRAME, [(0.0, peak - rate * FRAME), (FRAME, peak)])
+    assert linear - peak == pytest.approx(rate * FRAME, rel=1e-6)
+    assert (linear - true) / (peak - true) == pytest.approx(2.0, rel=1e-6)
+
+
+def test_position_law_has_no_error_at_a_reversal_of_a_linear_tissue():
+    k = 50.0
+    samples = [([0, 0, -1e-3], [0, 0, k * 1e-3]), ([0, 0, -2e-3], [0, 0, k * 2e-3])]
+    for depth in (3e-3, 2.5e-3, 1.5e-3, 0.5e-3):
+        np.testing.assert_allclose(position_law([0, 0, -depth], samples), [0, 0, k * depth])
+
+
+def test_printed_unsigned_projection_pushes_the_wrong_way_on_retreat_and_ours_does_not():
+    samples = [([0, 0, -1e-3], [0, 0, 0.1]), ([0, 0, -2e-3], [0, 0, 0.2])]
+    back = np.array([0, 0, -1.5e-3])
+    unsigned = 0.2 + abs(-0.5e-3) / 1e-3 * 0.1
+    signed = position_law(back, samples)[2]
+    assert unsigned == pytest.approx(0.25)
+    assert signed == pytest.approx(0.15)
+
+
+def test_position_law_ignores_motion_across_the_line_of_the_samples():
+    samples = [([0, 0, -1e-3], [0, 0, 0.1]), ([0, 0, -2e-3], [0, 0, 0.2])]
+    np.testing.assert_allclose(position_law([5e-3, -7e-3, -2e-3], samples), [0, 0, 0.2])
+
+
+@given(
+    st.floats(0, ex.SHORTEST * 0.999),
+    st.tuples(*[st.floats(-0.1, 0.1)] * 3),
+    st.tuples(*[st.floats(-5, 5)] * 3),
+)
+def test_a_resting_tool_holds_the_last_force(gap, position, force):
+    samples = [([0, 0, 0], [0, 0, 1.0]), ([0, 0, -gap], force)]
+    np.testing.assert_array_equal(position_law(position, samples), force)
+
+
+@given(st.floats(-0.1, 0.1), st.floats(1.001 * ex.SHORTEST, 0.02), st.floats(-3, 3))
+def test_position_law_is_bounded_in_reach_and_slope(along, gap, change):
+    samples = [([0, 0, 0], [0, 0, 0]), ([gap, 0, 0], [0, 0, change])]
+    out = position_law([along, 0, 0], samples, max_stiffness=300.0)
+    correction = abs(out[2] - change)
+    assert correction <= ex.FARTHEST * abs(change) * (1 + 1e-9)
+    assert correction <= 300.0 * abs(along - gap) * (1 + 1e-9) + 1e-15
+
+
+def test_time_law_is_bounded_in_reach_and_holds_when_the_clock_stands():
+    samples = [(0.0, 0.0), (FRAME, 1.0)]
+    assert time_law(100.0, samples) == pytest.approx(1 + ex.FARTHEST)
+    assert time_law(-100.0, samples) == 1.0
+    assert time_law(1.0, [(FRAME, 0.0), (FRAME, 1.0)]) == 1.0
+
+
+def test_local_stiffness_is_exact_for_a_linear_tissue_in_every_direction():
+    k = np.array([[40.0, 5, 0], [5, 60, -3], [0, -3, 80]])
+    at, force = np.array([1e-3, 0, -2e-3]), np.array([0.0, 0.1, 0.2])
+    moved = np.array([0.4e-3, -0.2e-3, 1e-3])
+    out = np.zeros(3)
+    ex.local_stiffness(at + moved, at, force, k, STIFF, out)
+    np.testing.assert_allclose(out, force - k @ moved)
+
+
+def test_local_stiffness_is_no_stiffer_than_the_device_renders():
+    out = np.zeros(3)
+    ex.local_stiffness(
+        np.array([0, 0, -1e-3]), np.zeros(3), np.zeros(3), 5000 * np.eye(3), 400.0, out
+    )
+    assert np.linalg.norm(out) <= 400.0 * 1e-3
+
+
+def test_directional_stiffness_is_the_resistance_along_a_direction():
+    k = np.diag([10.0, 20.0, 30.0])
+    assert ex.directional_stiffness(k, np.array([0, 0, -2e-3])) == pytest.approx(30)
+    assert ex.directional_stiffness(k, np.array([1e-3, 1e-3, 0])) == pytest.approx(15)
+    assert ex.directional_stiffness(k, np.zeros(3)) == 0
+
+
+@pytest.mark.parametrize('law', [ex.CONSTANT, ex.TIME, ex.POSITION])
+def test_one_sample_is_held(law):
+    h = history((0.0, [0, 0, 0], [0, 0, 0.4]))
+    out = np.zeros(3)
+    ex.estimate(law, h, ns(1.0), np.array([0, 0, 0.01]), STIFF, out)
+    np.testing.assert_array_equal(out, [0, 0, 0.4])
+
+
+@pytest.mark.parametrize('change', [{'topology': 2}, {'state': 2}])
+def test_a_cut_or_another_contact_state_makes_older_samples_void(change):
+    h = history((0.0, [0, 0, 0], [0, 0, 0.1]), (FRAME, [0, 0, -1e-3], [0, 0, 0.2]))
+    assert h[0]['count'] == 2
+    kept = {'topology': 1, 'state': 1} | change
+    ex.push(h, ns(2 * FRAME), [0, 0, -2e-3], [0, 0, 0.9], np.zeros((3, 3)), **kept)
+    assert h[0]['count'] == 1
+    out = np.zeros(3)
+    ex.estimate(ex.POSITION, h, 0, np.array([0, 0, -5e-3]), STIFF, out)
+    np.testing.assert_array_equal(out, [0, 0, 0.9])
+
+
+def test_stiffness_outlives_a_sample_without_one():
+    h = np.zeros(1, ex.HISTORY)
+    ex.push(h, 0, [0, 0, 0], [0, 0, 0], 30 * np.eye(3), topology=1, state=1)
+    ex.clear(h)
+    ex.push(h, 1, [0, 0, 0], [0, 0, 0], np.zeros((3, 3)), topology=1, state=0)
+    np.testing.assert_array_equal(h[0]['stiffness'], 30 * np.eye(3))

@@ -1,0 +1,210 @@
+"""A node is killed while the hand presses on the tissue: what the hand feels, and who lives on.
+
+Deadlines are measured by the stamps of the messages that were recorded. What the scheduler held the
+deciding loop up by is read off the same stamps and allowed for.
+"""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live import (
+    HAPTICS,
+    MEASURED_CF,
+    MEASURED_CP,
+    ROOT,
+    SERVO_CF,
+    TISSUE_FORCE,
+    LiveSession,
+    Recording,
+    deaths,
+    free_domain,
+    held_up,
+    two_presses,
+    wait_for,
+    worst_gap,
+    write_scene,
+    zero_from,
+)
+from rosbags.highlevel import AnyReader
+
+from bags.decode import decode
+from haptic_bridge.node import FOLLOW_PERIOD
+from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
+from session.graph import MODULES, node_environment
+from session.status import Status
+
+SECONDS = 7.0
+PRESSING = 0.25
+"""[N] that says that the hand is down; at rest there it feels a little more."""
+TISSUE_DEADLINE, BRIDGE_DEADLINE = 0.150, 0.030
+UNWRITTEN = 0.5
+"""[s] of a bag that a killed recorder may take along."""
+SAME = 0.02
+"""Share of the force by which two presses of the same depth may differ."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A session in which a node was killed at the time `killed` [s] of its recording."""
+
+    recording: Recording
+    killed: float
+
+
+Kill = Callable[[str], Fault]
+
+
+@pytest.fixture
+def domain() -> int:
+    return free_domain()
+
+
+@pytest.fixture
+def session(tmp_path: Path, domain: int) -> Iterator[LiveSession]:
+    scene = write_scene(tmp_path, two_presses(), SECONDS, cut_threshold=100.0)
+    session = LiveSession(tmp_path, scene, domain)
+    yield session
+    session.clean()
+
+
+@pytest.fixture
+def witness(tmp_path: Path, domain: int) -> Iterator['subprocess.Popen[str]']:
+    """Another recorder in the domain of the session, ready to hear."""
+    arguments = ['-r', '__node:=witness', '-p', f'bag:={tmp_path / "seen"}']
+    witness = subprocess.Popen(
+        [sys.executable, '-m', 'bags.node', '--ros-args', *arguments],
+        cwd=ROOT,
+        env=node_environment(domain),
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert witness.stdout is not None
+    assert witness.stdout.readline() == 'ready: witness\n'
+    yield witness
+    witness.kill()
+    witness.wait()
+
+
+@pytest.fixture
+def kill(session: LiveSession) -> Kill:
+    """Kills a node in contact, and checks what holds for every node: who lives, what is said."""
+
+    def kill_and_record(
+        node: str, folder: Path = session.bag, then: Callable[[], None] = lambda: None
+    ) -> Fault:
+        session.wait_until_pressed(PRESSING)
+        lived = session.running()
+        killed = session.kill(node)
+        wait_for(lambda: deaths(session.said), f'the launcher to say that {node} died')
+        assert session.running() == {n: p for n, p in lived.items() if n != node}
+        assert set(lived) == {*MODULES, 'launcher'}
+        assert session.end() == Status.NODE_DIED
+        assert deaths(session.said) == [node]
+        then()
+        recording = Recording(folder)
+        fault = Fault(recording, recording.at(killed))
+        times, norms = recording.force(SERVO_CF)
+        before = (times < fault.killed) & ~held_up(recording, times)
+        assert norms[before][-1] > PRESSING
+        return fault
+
+    return kill_and_record
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether rosbags reads every message of a bag."""
+    with AnyReader([folder]) as reader:
+        return sum(1 for _ in reader.messages()) == reader.message_count
+
+
+def test_force_fades_to_zero_and_stays_when_the_tissue_dies(
+    session: LiveSession, kill: Kill
+) -> None:
+    fault = kill('tissue_sim')
+    times, norms = fault.recording.force(SERVO_CF)
+    delay = worst_gap(times, fault.killed - 0.1, fault.killed + 0.3)
+    zero = zero_from(times, norms) - fault.killed
+    print(f'no force after {1e3 * zero:.1f} ms, scheduling delay {1e3 * delay:.1f} ms')
+    assert zero <= TISSUE_DEADLINE + FOLLOW_PERIOD + delay
+    assert times[-1] > fault.killed + 1.0
+    fading = (times > fault.killed) & (times < fault.killed + zero + delay)
+    drops = -np.diff(norms[fading]) / (np.diff(times[fading]) + 0.001)
+    assert drops.max() < 2 * norms.max() / HAPTICS.fade
+    measured, felt = fault.recording.force(MEASURED_CF)
+    assert zero_from(measured, felt) - fault.killed <= TISSUE_DEADLINE + 2 * delay + 0.002
+    assert is_complete(session.bag)
+
+
+def test_arm_lets_go_by_itself_and_the_tissue_comes_to_rest_when_the_bridge_dies(
+    session: LiveSession, kill: Kill
+) -> None:
+    fault = kill('haptic_bridge')
+    times, norms = fault.recording.force(MEASURED_CF)
+    delay = worst_gap(times, fault.killed - 0.1, fault.killed + 0.3)
+    zero = zero_from(times, norms) - fault.killed
+    print(f'no force after {1e3 * zero:.1f} ms, scheduling delay {1e3 * delay:.1f} ms')
+    assert zero <= BRIDGE_DEADLINE + delay
+    assert times[-1] > fault.killed + 1.0
+    frames, kinetic, elastic = fault.recording.read(
+        TISSUE_FORCE, ForceSampleCodec(), 'kinetic_energy', 'elastic_energy'
+    )
+    energy = (kinetic + elastic)[:, 0]
+    assert frames[-1] > fault.killed + 1.0
+    assert energy[frames > fault.killed + 0.8].max() < 1e-3 * energy[frames < fault.killed][-1]
+    assert is_complete(session.bag)
+
+
+def test_palpation_goes_on_undisturbed_when_cutting_dies(session: LiveSession, kill: Kill) -> None:
+    fault = kill('cutting')
+    assert_undisturbed(fault)
+    assert is_complete(session.bag)
+
+
+def test_palpation_goes_on_undisturbed_when_the_recorder_dies(
+    witness: 'subprocess.Popen[str]',
+    session: LiveSession,
+    kill: Callable[..., Fault],
+    tmp_path: Path,
+) -> None:
+    fault = kill('recorder', tmp_path / 'seen', lambda: end(witness))
+    assert_undisturbed(fault)
+    cut_off = Recording(session.bag)
+    assert not cut_off.complete
+    times, norms = cut_off.force(SERVO_CF)
+    assert norms[-1] > PRESSING
+    last = fault.recording.at(cut_off.start) + times[-1]
+    assert 0 < fault.killed - last < UNWRITTEN
+
+
+def assert_undisturbed(fault: Fault) -> None:
+    """The hand feels on as before: nothing at the moment itself, and the same in the next press."""
+    times, norms = fault.recording.force(SERVO_CF)
+    undelayed = ~held_up(fault.recording, times)
+    around = undelayed & (np.abs(times - fault.killed) < 0.2)
+    assert np.ptp(norms[around]) < SAME * norms[around].mean()
+    poses, positions = fault.recording.read(MEASURED_CP, PoseStampedCodec(), 'position')
+    depth = positions[:, 2].max() - positions[:, 2]
+    down = poses[depth > depth.max() - 1e-4]
+    (border,) = np.flatnonzero(np.diff(down) > 0.2)
+    before, after = (
+        norms[undelayed & (times > press[0] + 0.3) & (times < press[-1] - 0.3)]
+        for press in (down[: border + 1], down[border + 1 :])
+    )
+    assert down[0] < fault.killed < down[border]
+    np.testing.assert_allclose(after, before.mean(), rtol=SAME)
+    assert zero_from(times, norms) < times[-1]
+    states = fault.recording.messages('/haptic_bridge/operating_state')
+    assert 'FAULT' not in [decode(message).state for message in states]
+
+
+def end(witness: 'subprocess.Popen[str]') -> None:
+    """Ends a witness in order."""
+    witness.send_signal(signal.SIGINT)
+    witness.communicate(timeout=20)
+    assert witness.returncode == 0

@@ -1,0 +1,254 @@
+"""A whole session on the real graph, and sessions that the user interrupts."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live import (
+    CONTACT,
+    MEASURED_CP,
+    SERVO_CF,
+    SPOT,
+    TISSUE_FORCE,
+    LiveSession,
+    Recording,
+    free_domain,
+    phase,
+    two_presses,
+    wait_for,
+    write_scene,
+    zero_from,
+)
+from rosbags.highlevel import AnyReader
+
+from bags.decode import decode
+from bags.metadata import read_metadata
+from haptic_bridge.settings import DeviceSettings
+from haptic_bridge.wire import (
+    ContactCodec,
+    ForceSampleCodec,
+    PoseStampedCodec,
+    WrenchStampedCodec,
+)
+from session.graph import MODULES
+from session.status import Status
+from tissue_sim.replica import MeshReplica
+
+DEVICE = DeviceSettings().load_profile()
+SECONDS = 10.5
+"""Twice the time between keyframes and more: one of them shows the tissue after the cut."""
+ANSWERED = 0.1
+"""[s] of a contact in which the hand may feel the proxy's spring, not yet the tissue."""
+HOVER = 0.015
+"""[m] height of the tip 1 mm before it touches."""
+SETTLING = 0.1
+"""[s] in which the tissue that the blade or the tip has left is let go by the simulation."""
+SENT_LATE = 1e-3
+"""[s] between a tick's reading of the clock and the stamp of its command, on a busy machine."""
+
+
+@pytest.fixture(scope='module')
+def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSession]:
+    """Palpates at two places, cuts from one side to the other, and retracts."""
+    folder = tmp_path_factory.mktemp('whole')
+    x, y = SPOT
+    second = (0.0, 0.010)
+    phases = [
+        phase('approach', (x, y, HOVER, 1.0), share=0.8),
+        phase(
+            'palpate',
+            *((x, y, 0.0105, 1.5), (x, y, HOVER, 0.8), (*second, HOVER, 0.8)),
+            *((*second, 0.0105, 1.5), (*second, HOVER, 0.8), (x, 0.004, 0.018, 0.8)),
+            share=5.0,
+        ),
+        phase('cut', (x, 0.004, 0.006, 1.0), (0.016, 0.004, 0.008, 1.5), share=2.2),
+        phase('retract', (0.016, 0.004, 0.040, 1.0), share=1.0),
+        phase('rest', share=1.5),
+    ]
+    session = LiveSession(
+        folder, write_scene(folder, phases, SECONDS, cut_threshold=0.6), free_domain()
+    )
+    yield session
+    session.clean()
+
+
+@pytest.fixture(scope='module')
+def recording(session: LiveSession) -> Recording:
+    status = session.end()
+    print(session.said)
+    assert status == Status.OK, session.said
+    return Recording(session.bag)
+
+
+def palpations(recording: Recording) -> list[tuple[float, float]]:
+    """When the tip touched the tissue, whole and from outside [s]: from, to."""
+    times, states = recording.read(CONTACT, ContactCodec(), 'state')
+    touching = np.concatenate([[0], states[:, 0] > 0, [0]])
+    edges = np.flatnonzero(np.diff(touching))
+    cut = times[states[:, 0] > 1][0]
+    spans = [(times[a], times[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [(start, end) for start, end in spans if end < cut and end - start > 0.1]
+
+
+def test_session_runs_to_its_end_and_says_so(session: LiveSession, recording: Recording) -> None:
+    assert recording.complete
+    assert not session.running()
+    assert (session.bag / 'log').is_dir()
+    assert 'elements cut' in session.said
+
+
+def test_there_is_no_force_before_the_first_contact_and_none_after_the_last(
+    recording: Recording,
+) -> None:
+    times, norms = recording.force(SERVO_CF)
+    contacts, states = recording.read(CONTACT, ContactCodec(), 'state')
+    touching = contacts[states[:, 0] > 0]
+    assert times[0] < touching[0] - 0.3
+    assert times[-1] > touching[-1] + 0.3
+    assert not norms[times < touching[0]].any()
+    assert norms[(times > touching[0]) & (times < touching[-1])].any()
+    assert zero_from(times, norms) < touching[-1] + SETTLING
+
+
+def test_force_rises_with_depth_on_the_way_in_of_each_palpation(recording: Recording) -> None:
+    times, forces = recording.read(SERVO_CF, WrenchStampedCodec(), 'force')
+    poses, positions = recording.read(MEASURED_CP, PoseStampedCodec(), 'position')
+    heights = np.interp(times, poses, positions[:, 2])
+    found = palpations(recording)
+    assert len(found) == 2
+    for start, end in found:
+        inside = np.flatnonzero((times >= start) & (times <= end))
+        way_in = inside[: 1 + np.argmin(heights[inside])]
+        depth, force = heights[way_in[0]] - heights[way_in], forces[way_in, 2]
+        assert depth[-1] > 1e-3 and force[-1] > 0.1
+        correlation = np.corrcoef(depth, force)[0, 1]
+        print(f'correlation {correlation:.4f} to {depth[-1] * 1e3:.2f} mm')
+        assert correlation > 0.98
+        answered = force[times[way_in] > start + ANSWERED]
+        assert (np.maximum.accumulate(answered) - answered).max() < 0.1 * force.max()
+
+
+def test_energy_of_the_tissue_decays_after_each_release(recording: Recording) -> None:
+    times, states, kinetic, elastic = recording.read(
+        TISSUE_FORCE, ForceSampleCodec(), 'state', 'kinetic_energy', 'elastic_energy'
+    )
+    energy, loaded = (kinetic + elastic)[:, 0], states[:, 0] > 0
+    released = np.flatnonzero(loaded[:-1] & ~loaded[1:]) + 1
+    starts = np.append(np.flatnonzero(~loaded[:-1] & loaded[1:]), len(loaded) - 1)
+    free = [(a, starts[starts >= a][0]) for a in released]
+    long = [(a, b) for a, b in free if times[b] - times[a] > 0.3]
+    assert len(long) >= 3
+    for a, b in long:
+        largest = energy[:a].max()
+        assert np.diff(energy[a : b + 1]).max() <= 1e-9 * largest
+        assert energy[b] < 1e-3 * largest
+
+
+def test_commanded_force_stays_within_what_the_device_bears(recording: Recording) -> None:
+    times, forces = recording.read(SERVO_CF, WrenchStampedCodec(), 'force')
+    assert np.linalg.norm(forces, axis=1).max() <= DEVICE.max_force
+    steps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
+    assert (steps <= DEVICE.max_slew * (np.diff(times) + SENT_LATE)).all()
+
+
+def test_every_message_of_the_bag_is_counted_and_understood_by_rosbags(
+    session: LiveSession, recording: Recording
+) -> None:
+    counts: Counter[str] = Counter()
+    with AnyReader([session.bag]) as reader:
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+            counts[connection.topic] += 1
+    entries = read_metadata(session.bag)['topics_with_message_count']
+    listed = {entry['topic_metadata']['name']: entry['message_count'] for entry in entries}
+    assert counts == {topic: count for topic, count in listed.items() if count}
+    assert counts == {t: len(recording.messages(t)) for t in counts}
+    assert counts[SERVO_CF] > 1000 * SECONDS / 2
+
+
+def test_deltas_lead_from_the_first_keyframe_to_the_arrays_of_a_later_one_bit_for_bit(
+    recording: Recording,
+) -> None:
+    keyframes = [decode(message) for message in recording.messages('/tissue/mesh')]
+    later = keyframes[-1]
+    replica = MeshReplica()
+    replica.load(keyframes[0])
+    assert replica.hash() == keyframes[0].state_hash
+    for delta in map(decode, recording.messages('/tissue/mesh_updates')):
+        assert replica.apply(delta)
+        if delta.state_hash:
+            assert replica.hash() == delta.state_hash
+        if delta.revision == later.revision:
+            break
+    assert replica.revision == later.revision > keyframes[0].revision
+    assert later.topology == delta.topology > keyframes[0].topology
+    assert replica.hash() == later.state_hash
+
+
+MOMENTS = {
+    'as the first node starts': lambda session: wait_for(
+        lambda: len(session.running()) > 1, 'a node'
+    ),
+    'while the nodes start': lambda session: session.wait_until_said('recorder is ready'),
+    'in contact': lambda session: session.wait_until_pressed(0.25),
+}
+
+
+@pytest.fixture
+def interrupted(tmp_path: Path) -> Iterator[LiveSession]:
+    scene = write_scene(tmp_path, two_presses(), 7.0, cut_threshold=100.0)
+    session = LiveSession(tmp_path, scene, free_domain())
+    yield session
+    session.clean()
+
+
+def assert_nothing_left(session: LiveSession) -> None:
+    """No process, and no bag that cannot be read."""
+    assert session.end() == Status.INTERRUPTED, session.said
+    assert not session.running()
+    assert 'Traceback' not in session.said
+    if list(session.bag.glob('*.mcap')):
+        with AnyReader([session.bag]) as reader:
+            assert sum(1 for _ in reader.messages()) == reader.message_count
+
+
+def test_interrupt_of_a_launcher_that_has_just_begun_ends_it(interrupted: LiveSession) -> None:
+    wait_for(interrupted.running, 'the launcher')
+    interrupted.interrupt()
+    assert interrupted.end() != Status.OK  # Python itself may not have started yet
+    assert not interrupted.running()
+
+
+@pytest.mark.parametrize('moment', MOMENTS)
+def test_interrupt_ends_every_process_and_closes_the_bag(
+    interrupted: LiveSession, moment: str
+) -> None:
+    MOMENTS[moment](interrupted)
+    interrupted.interrupt()
+    assert_nothing_left(interrupted)
+    if moment == 'in contact':
+        assert Recording(interrupted.bag).complete
+        assert set(MODULES) == {path.stem for path in (interrupted.bag / 'log').iterdir()}
+
+
+@pytest.mark.parametrize('pause', [0.0, 0.3])
+def test_second_interrupt_leaves_nothing_either(interrupted: LiveSession, pause: float) -> None:
+    interrupted.wait_until_pressed(0.25)
+    interrupted.interrupt()
+    time.sleep(pause)
+    interrupted.interrupt()
+    assert_nothing_left(interrupted)
+    assert Recording(interrupted.bag).complete
+
+
+def test_interrupt_while_the_bag_is_read_at_the_end_is_an_interrupt_as_any(
+    interrupted: LiveSession,
+) -> None:
+    interrupted.wait_until_pressed(0.25)
+    interrupted.interrupt()
+    wait_for(lambda: list(interrupted.running()) == ['launcher'], 'the nodes to end')
+    interrupted.interrupt()
+    assert_nothing_left(interrupted)
