@@ -1,12 +1,15 @@
 """The five nodes of a session, with the parameters that the command line gives them."""
 
+import os
+
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
-from launch.substitutions import EnvironmentVariable, LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
+from session.graph import discovery
 
 CONFIG = [FindPackageShare('cutting_trainer'), 'config']
 ARGUMENTS = {
@@ -28,11 +31,6 @@ NODES = {
     'recorder': ('bag',),
 }
 """Executable, which is the node's name too, and the parameters that it has beside the common."""
-ENVIRONMENT = {
-    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-    'FASTRTPS_DEFAULT_PROFILES_FILE': PathJoinSubstitution([*CONFIG, 'fastdds.xml']),
-}
-"""What the nodes get unless the shell says else."""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -56,8 +54,5 @@ def generate_launch_description() -> LaunchDescription:
         )
         for name, own in NODES.items()
     ]
-    environment = [
-        SetEnvironmentVariable(name, EnvironmentVariable(name, default_value=value))
-        for name, value in ENVIRONMENT.items()
-    ]
+    environment = [SetEnvironmentVariable(*item) for item in discovery(os.environ).items()]
     return LaunchDescription([*arguments, *environment, *nodes])

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from session.node_process import NodeCommand
@@ -19,6 +20,7 @@ MODULES = {
     RECORDER_NODE: 'bags.node',
 }
 CLOSING_A_BAG = 20.0  # [s]
+RANGE, PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[NodeCommand]:
@@ -47,6 +49,23 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
     return commands
 
 
+def discovery(environ: Mapping[str, str]) -> dict[str, str]:
+    """The variables that keep the nodes to this machine unless the shell says else.
+
+    The profile does what the range LOCALHOST asks for: with that word, rmw_fastrtps would add
+    transports of its own, shared memory and sockets on all interfaces (config/dds/localhost.xml).
+
+    Args:
+        environ: of the shell.
+    """
+    given = environ.get(RANGE, 'LOCALHOST')
+    profile = 'localhost' if given == 'LOCALHOST' else 'network'
+    path = str(share_folder() / 'config' / 'dds' / f'{profile}.xml')
+    if environ.get(PROFILES, path) != path:
+        return {RANGE: given, PROFILES: environ[PROFILES]}
+    return {RANGE: 'SYSTEM_DEFAULT' if given == 'LOCALHOST' else given, PROFILES: path}
+
+
 def node_environment(domain: int) -> dict[str, str]:
     """The one environment of all nodes: this process's own, on this machine unless it says else.
 
@@ -56,9 +75,8 @@ def node_environment(domain: int) -> dict[str, str]:
     inherited = dict(os.environ)
     path = [str(PACKAGES), *filter(None, [inherited.get('PYTHONPATH')])]
     return {
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'FASTRTPS_DEFAULT_PROFILES_FILE': str(share_folder() / 'config' / 'fastdds.xml'),
         **inherited,
+        **discovery(inherited),
         'ROS_DOMAIN_ID': str(domain),
         'PYTHONPATH': os.pathsep.join(path),
         'PYTHONUNBUFFERED': '1',

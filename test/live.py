@@ -243,8 +243,9 @@ def zero_from(times: np.ndarray, norms: np.ndarray) -> float:
 
 
 def worst_gap(times: np.ndarray, start: float, end: float) -> float:
-    """The longest time [s] between two samples of an interval, which the scheduler made of 1 ms."""
-    return float(np.diff(times[(times > start) & (times < end)]).max())
+    """The longest time [s] from a sample of an interval to the next: the scheduler's, of 1 ms."""
+    within = (times[:-1] > start) & (times[:-1] < end)
+    return float(np.diff(times)[within].max())
 
 
 def held_up(recording: Recording, times: np.ndarray) -> np.ndarray:

@@ -174,5 +174,5 @@ def test_nodes_get_their_parameters_quoted_and_one_environment(
     monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
     environment = node_environment(5)
     assert environment['ROS_DOMAIN_ID'] == '5'
-    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    assert environment['FASTRTPS_DEFAULT_PROFILES_FILE'].endswith('config/dds/localhost.xml')
     assert environment['PYTHONPATH'].split(os.pathsep)[0] == str(ROOT)

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from session.graph import MODULES, node_environment, session_nodes
+from session.graph import MODULES, PROFILES, RANGE, node_environment, session_nodes
 from tissue_sim.share import is_checkout, share_folder
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -137,7 +137,6 @@ def launch_description(monkeypatch: pytest.MonkeyPatch) -> Any:
         'launch': ['LaunchDescription'],
         'launch.actions': ['DeclareLaunchArgument', 'SetEnvironmentVariable'],
         'launch.substitutions': [
-            'EnvironmentVariable',
             'LaunchConfiguration',
             'PathJoinSubstitution',
         ],
@@ -177,20 +176,15 @@ def test_launch_file_starts_the_nodes_of_a_session_with_the_same_parameters(
 def test_launch_file_gives_the_nodes_the_environment_of_a_session_unless_the_shell_has_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'):
-        monkeypatch.delenv(name, raising=False)
-    (entities,) = launch_description(monkeypatch).args
-    of_session = node_environment(0)
-    variables = [e.args for e in entities if type(e).__name__ == 'SetEnvironmentVariable']
-    assert len(variables) == 2
-    for name, value in variables:
-        assert value.args == (name,)  # what the shell has
-        default = value.kwargs['default_value']
-        if isinstance(default, str):
-            assert default == of_session[name]
-        else:
-            (parts,) = default.args
-            assert of_session[name].endswith('/'.join(parts[1:]))
+    for shell in ({}, {RANGE: 'SUBNET'}, {PROFILES: '/own.xml'}):
+        for name in (RANGE, PROFILES):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in shell.items():
+            monkeypatch.setenv(name, value)
+        (entities,) = launch_description(monkeypatch).args
+        variables = [e.args for e in entities if type(e).__name__ == 'SetEnvironmentVariable']
+        assert dict(variables).items() <= node_environment(0).items()
+        assert {name for name, _ in variables} == {RANGE, PROFILES}
 
 
 def test_launch_file_starts_executables_that_are_installed(
@@ -254,7 +248,7 @@ def test_installed_trainer_finds_scenes_devices_and_profiles(tmp_path: Path) -> 
     )
     assert done.stdout.split() == [
         str(share / 'config' / 'scenes' / 'liver.yaml'),
-        str(share / 'config' / 'fastdds.xml'),
+        str(share / 'config' / 'dds' / 'localhost.xml'),
         str(tmp_path / 'bags' / 'sessions'),
     ]
 

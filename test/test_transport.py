@@ -1,0 +1,124 @@
+"""The transport between the nodes: on this machine only, and no process can hold up another's."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live import ROOT, free_domain
+
+from session.graph import PROFILES, RANGE, discovery, node_environment
+
+FREEZES, FROZEN = 40, 0.25
+"""A process that is stopped, or killed, at a random moment may hold a lock."""
+TALK = """
+import os, sys, time
+import rclpy
+from std_msgs.msg import Header
+from tissue_sim.ros import STREAM
+
+role = sys.argv[1]
+rclpy.init()
+node = rclpy.create_node(f'{role}_{os.getpid()}')
+if role == 'reader':
+    heard = [node.create_subscription(Header, n, lambda _: None, STREAM) for n in ('a', 'b')]
+    print('ready', flush=True)
+    rclpy.spin(node)
+publisher = node.create_publisher(Header, 'a' if role == 'steady' else 'b', STREAM)
+while not publisher.get_subscription_count():
+    time.sleep(0.01)
+print('ready', flush=True)
+while role == 'flood':
+    publisher.publish(Header(frame_id='x' * 100))
+last = time.monotonic()
+while True:
+    time.sleep(0.001)
+    before = time.monotonic()
+    publisher.publish(Header(frame_id='x' * 100))
+    print(time.monotonic() - before, flush=True)
+"""
+
+
+@contextmanager
+def process(role: str, environment: dict[str, str]) -> Iterator['subprocess.Popen[str]']:
+    """A process that publishes or listens, ready; killed at the end."""
+    talk = subprocess.Popen(
+        [sys.executable, '-c', TALK, role], stdout=subprocess.PIPE, env=environment, text=True
+    )
+    try:
+        assert talk.stdout is not None
+        assert talk.stdout.readline() == 'ready\n'
+        yield talk
+    finally:
+        talk.kill()
+        talk.communicate()
+
+
+def sockets(pid: int) -> set[str]:
+    """Local addresses, as the kernel writes them, of the UDP sockets of a process."""
+    own = {str(fd.readlink()) for fd in Path(f'/proc/{pid}/fd').iterdir()}
+    rows = [r.split() for r in Path('/proc/net/udp').read_text().splitlines()[1:]]
+    return {row[1].partition(':')[0] for row in rows if f'socket:[{row[9]}]' in own}
+
+
+@pytest.fixture
+def environment() -> dict[str, str]:
+    return node_environment(free_domain())
+
+
+def test_writer_is_not_held_up_by_another_that_is_frozen_while_it_writes(
+    environment: dict[str, str],
+) -> None:
+    with (
+        process('reader', environment),
+        process('steady', environment) as steady,
+        process('flood', environment) as flood,
+    ):
+        for _ in range(FREEZES):
+            flood.send_signal(signal.SIGSTOP)
+            time.sleep(FROZEN)
+            flood.send_signal(signal.SIGCONT)
+            time.sleep(0.01)
+        steady.kill()
+        assert steady.stdout is not None
+        took = [float(line) for line in steady.stdout.read().splitlines()]
+    assert len(took) > 1000
+    assert np.max(took) < 0.8 * FROZEN
+
+
+def test_nodes_share_no_memory_and_listen_on_this_machine_only(environment: dict[str, str]) -> None:
+    with process('reader', environment) as reader:
+        assert '/dev/shm/fastrtps' not in Path(f'/proc/{reader.pid}/maps').read_text()
+        assert sockets(reader.pid) == {'0100007F'}
+
+
+def test_node_with_the_range_of_everybody_else_is_heard(environment: dict[str, str]) -> None:
+    foreign = {k: v for k, v in environment.items() if k != PROFILES} | {RANGE: 'LOCALHOST'}
+    with process('reader', environment), process('steady', foreign) as steady:
+        assert steady.poll() is None  # it has found the reader
+    with process('reader', foreign), process('steady', environment) as steady:
+        assert steady.poll() is None
+
+
+@pytest.mark.parametrize(
+    ('shell', 'expected'),
+    [
+        ({}, ('SYSTEM_DEFAULT', 'localhost')),
+        ({RANGE: 'LOCALHOST'}, ('SYSTEM_DEFAULT', 'localhost')),
+        ({RANGE: 'SUBNET'}, ('SUBNET', 'network')),
+        ({PROFILES: '/own.xml'}, ('LOCALHOST', '/own.xml')),
+        ({RANGE: 'SUBNET', PROFILES: '/own.xml'}, ('SUBNET', '/own.xml')),
+    ],
+)
+def test_shell_decides_how_far_the_nodes_reach(
+    shell: dict[str, str], expected: tuple[str, str]
+) -> None:
+    asked, profile = expected
+    path = profile if profile.startswith('/') else str(ROOT / f'config/dds/{profile}.xml')
+    assert discovery(shell) == {RANGE: asked, PROFILES: path}
+    assert discovery(shell | discovery(shell)) == discovery(shell)
