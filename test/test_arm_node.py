@@ -29,6 +29,8 @@ from haptic_bridge.wire import (
 from tissue_sim import ros
 from tissue_sim.timing import request_real_time
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = 88
 STIFFNESS = 400.0

@@ -36,6 +36,8 @@ from tissue_sim import ros
 from tissue_sim.timing import request_real_time
 
 ROOT = Path(__file__).resolve().parents[1]
+pytestmark = pytest.mark.real_time
+
 DOMAIN = '87'
 RADIUS = 0.004
 K = 80.0

@@ -37,6 +37,8 @@ from session.graph import MODULES
 from session.status import Status
 from tissue_sim.replica import MeshReplica
 
+pytestmark = pytest.mark.real_time
+
 DEVICE = DeviceSettings().load_profile()
 SECONDS = 10.5
 """Twice the time between keyframes and more: one of them shows the tissue after the cut."""

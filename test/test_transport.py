@@ -14,6 +14,8 @@ from live import ROOT, free_domain
 
 from session.graph import PROFILES, RANGE, discovery, node_environment
 
+pytestmark = pytest.mark.real_time
+
 FREEZES, FROZEN = 40, 0.25
 """A process that is stopped, or killed, at a random moment may hold a lock."""
 TALK = """
