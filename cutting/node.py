@@ -23,6 +23,10 @@ from tissue_sim.replica import MeshReplica
 from tissue_sim.scene_file import read_section
 
 _REMEMBERED = 16
+_PATIENCE = 0.25
+"""How long [s] a request waits for the delta that it has overtaken."""
+_ASK_AGAIN = 1.0
+"""[s] after which a whole mesh that was asked for and did not come is asked for again."""
 
 
 class CuttingNode(Node):
@@ -38,11 +42,13 @@ class CuttingNode(Node):
         self._replica = MeshReplica()
         self._mesh: TetMesh | None = None
         self._displacements: deque[tuple[int, np.ndarray]] = deque(maxlen=_REMEMBERED)
-        self._asking = False
+        self._asked = -_ASK_AGAIN
         self._counts: Counter[str] = Counter()
         self._slowest = 0.0
         self.create_subscription(Mesh, ros.MESH, self._take_mesh, ros.LATCHED)
-        self.create_subscription(MeshDelta, ros.MESH_UPDATES, self._take_delta, ros.UPDATES)
+        self._deltas = self.create_subscription(
+            MeshDelta, ros.MESH_UPDATES, self._take_delta, ros.UPDATES
+        )
         self._get_mesh = self.create_client(GetMesh, ros.GET_MESH)
         self.create_service(Cut, ros.CUT, self._serve)
         self._diagnostics = ros.Diagnostics(self, self._status)
@@ -104,20 +110,25 @@ class CuttingNode(Node):
     def _remember(self) -> None:
         self._displacements.append((self._replica.revision, self._replica.displacement.copy()))
 
+    @property
+    def _asking(self) -> bool:
+        return time.monotonic() - self._asked < _ASK_AGAIN
+
     def _ask_for_mesh(self) -> None:
         if self._asking or not self._get_mesh.service_is_ready():
             return
-        self._asking = True
+        self._asked = time.monotonic()
         self._counts['mesh fetched'] += 1
         self._get_mesh.call_async(GetMesh.Request()).add_done_callback(self._got_mesh)
 
     def _got_mesh(self, future) -> None:  # type: ignore[no-untyped-def]
-        self._asking = False
+        self._asked = -_ASK_AGAIN
         response = future.result()
         if response is not None and response.success:
             self._load(response.mesh)
 
     def _serve(self, request: Cut.Request, response: Cut.Response) -> Cut.Response:
+        self._catch_up(request.revision)
         begun = time.perf_counter()
         response.revision = request.revision
         try:
@@ -140,13 +151,26 @@ class CuttingNode(Node):
         self._slowest = max(self._slowest, time.perf_counter() - begun)
         return response
 
+    def _catch_up(self, revision: int) -> None:
+        """Takes the deltas up to a revision: a request may overtake the one it belongs to."""
+        deadline = time.monotonic() + _PATIENCE
+        while self._mesh is not None and self._replica.revision < revision and not self._asking:
+            delta = ros.take(self._deltas)
+            if delta is not None:
+                self._take_delta(delta)
+            elif time.monotonic() > deadline:
+                return
+            else:
+                time.sleep(0.0005)
+
     def _cut(self, request: Cut.Request) -> tuple[tuple[int, str], CutResult | None]:
         if self._mesh is None:
             return (Cut.Response.NOT_READY, 'no mesh has come yet on tissue/mesh'), None
         displacement = dict(self._displacements).get(request.revision)
         if displacement is None or len(displacement) != len(self._replica.rest):
-            have = [revision for revision, _ in self._displacements]
-            text = f'revision {request.revision} is not at hand; revisions {have} are'
+            first, last = self._displacements[0][0], self._displacements[-1][0]
+            text = f'revision {request.revision} is not at hand; revisions {first} to {last} are'
+            text += ', and the whole mesh has been asked for' if self._asking else ''
             return (Cut.Response.WRONG_REVISION, text), None
         if self._mesh.topology != self._replica.topology:
             # Who asks has been given the last answer, or has given it up: what it knows counts.

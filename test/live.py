@@ -58,15 +58,23 @@ def two_presses() -> list[Any]:
     ]
 
 
-def write_scene(folder: Path, phases: list[Any], seconds: float, cut_threshold: float) -> Path:
+def write_scene(
+    folder: Path,
+    phases: list[Any],
+    seconds: float,
+    cut_threshold: float,
+    method: str = 'delete',
+    mesh: Path = ROOT / 'config' / 'meshes' / 'block_yi2007.msh',
+) -> Path:
     """A scene of the block of the thesis, of liver as stiff as it is in the body."""
     source = ROOT / 'config' / 'scenes' / 'block.yaml'
     scene = YAML(typ='safe').load(source)
     tissue = scene['tissue']
-    tissue['mesh'] = str(ROOT / 'config' / 'meshes' / 'block_yi2007.msh')
+    tissue['mesh'] = str(mesh)
     tissue['material'] = {'preset': 'liver_elastography', 'toughness': 20, 'blade_friction': 5}
     tissue['damping'] = {'alpha': 10, 'beta': 1e-3}
     tissue['cut_threshold'] = cut_threshold
+    scene['cutting'] = {'method': method}
     scene['arm']['script']['start']['position'] = [*SPOT, 0.030]
     scene['arm']['script'] |= {'seconds': seconds, 'phases': phases}
     scene['session']['seconds'] = seconds
@@ -95,13 +103,13 @@ def free_domain() -> int:
 
 
 @contextmanager
-def onlooker(domain: int) -> Iterator[Any]:
-    """A subscription to the commanded force in this process, to be polled."""
+def onlooker(domain: int, kind: Any = WrenchStamped, topic: str = SERVO_CF) -> Iterator[Any]:
+    """A subscription in this process, to be polled; to the commanded force unless it is said."""
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     node = Node('onlooker', context=context)
     try:
-        yield polled(node, WrenchStamped, SERVO_CF, NEWEST_BEST_EFFORT)
+        yield polled(node, kind, topic, NEWEST_BEST_EFFORT)
     finally:
         node.destroy_node()
         rclpy.shutdown(context=context)
@@ -118,7 +126,7 @@ class LiveSession:
 
     def __init__(self, folder: Path, scene: Path, domain: int) -> None:
         self.bag = folder / 'bag'
-        self._domain = domain
+        self.domain = domain
         self.scene = scene
         self._said = folder / 'said'
         command = [sys.executable, '-m', 'session.cli', 'demo', '--domain', str(domain)]
@@ -160,7 +168,7 @@ class LiveSession:
     def wait_until_pressed(self, least: float) -> None:
         """Returns when the force on the hand [N] has stayed above a value for a while."""
         rest = -np.inf
-        with onlooker(self._domain) as forces:
+        with onlooker(self.domain) as forces:
 
             def pressed() -> bool:
                 nonlocal rest
@@ -174,6 +182,11 @@ class LiveSession:
             wait_for(lambda: take_raw(forces), 'the first force')
             rest = time.monotonic()
             wait_for(pressed, 'the hand to press')
+
+    def command(self, node: str) -> list[str]:
+        """Program and arguments of a node that runs."""
+        line = Path(f'/proc/{self.running()[node]}/cmdline').read_bytes().decode()
+        return line.rstrip('\0').split('\0')
 
     def interrupt(self) -> None:
         """What Ctrl-C does."""

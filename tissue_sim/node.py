@@ -19,7 +19,7 @@ from tissue_sim.mesh import TetMesh, Touched
 from tissue_sim.mesh_io import load_tissue
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
-from tissue_sim.simulation import Frame, TissueSimulation, ToolContact
+from tissue_sim.simulation import Command, Frame, TissueSimulation, ToolContact
 from tissue_sim.timing import PeriodicLoop
 from tissue_sim.warm_up import warm_up
 
@@ -148,6 +148,9 @@ class TissueSimNode(Node):
             request.root_from, request.tip_from = frame.sweep.root_from, frame.sweep.tip_from
             request.root_to, request.tip_to = frame.sweep.root_to, frame.sweep.tip_to
         if not self._cutting.service_is_ready():
+            if frame.command == Command.FINISH:
+                self._simulation.cut_done()  # nobody is there who could remember the stroke
+                return
             self._simulation.cut_failed()
             self._reject('cut', 'the service cutting/cut is not there')
             return
@@ -167,6 +170,10 @@ class TissueSimNode(Node):
             return
         response, self._cut = self._cut.result(), None
         try:
+            if response.error_code == Cut.Response.INVALID_SWEEP:
+                self._simulation.cut_done()
+                self._reject('cut', f'{response.error_msg}: this sweep stays uncut')
+                return
             if not response.success:
                 raise ValueError(response.error_msg)
             if response.topology != self._simulation.mesh.topology:

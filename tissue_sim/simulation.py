@@ -147,7 +147,7 @@ class TissueSimulation:
         self._blade: Blade | None = None
         self._target: np.ndarray | None = None
         self._load = Coupling()
-        self._outstanding = False
+        self._outstanding: Command | None = None
         self._finish_due = False
         self._still = 0
         self._step_bounds: dict[float, float] = {}
@@ -374,19 +374,20 @@ class TissueSimulation:
         if contact is not None and (contact.state == State.NONE or self._clear(contact)):
             self._let_go()
             return self._next_finish(), None
+        finish = self._next_finish()  # of the stroke before
         sweep = self._blade.sweep()
-        if self._outstanding or sweep is None:
-            return None, None
+        if self._outstanding is not None or sweep is None:
+            return finish, None
         self._blade.swept()
-        self._outstanding = True
+        self._outstanding = Command.ADVANCE
         return Command.ADVANCE, sweep
 
     def _next_finish(self) -> Command | None:
-        """FINISH, once, as soon as no answer is awaited any more."""
-        if not self._finish_due or self._outstanding:
+        """FINISH, until it is answered, as soon as no other answer is awaited."""
+        if not self._finish_due or self._outstanding is not None:
             return None
         self._finish_due = False
-        self._outstanding = True
+        self._outstanding = Command.FINISH
         return Command.FINISH
 
     def _let_go(self) -> None:
@@ -444,7 +445,7 @@ class TissueSimulation:
         Raises:
             MeshError: the change does not fit the mesh.
         """
-        self._outstanding = False
+        self._outstanding = None
         self._still = 0
         n, total = self.mesh.node_count, self.mesh.node_count + len(delta.node_parents)
         touched = self.mesh.apply(delta)
@@ -464,11 +465,13 @@ class TissueSimulation:
         return touched
 
     def cut_done(self) -> None:
-        """The cutting service had nothing to change."""
-        self._outstanding = False
+        """The cutting service had nothing to change, or will never do what it was asked."""
+        self._outstanding = None
 
     def cut_failed(self) -> None:
-        """The cutting service gave no answer, or refused: the next sweep begins where it did."""
-        self._outstanding = False
-        if self._blade is not None:
+        """The cutting service gave no answer, or refused: it is asked again (`Blade.unswept`)."""
+        failed, self._outstanding = self._outstanding, None
+        if failed == Command.FINISH:
+            self._finish_due = True
+        elif failed == Command.ADVANCE and self._blade is not None:
             self._blade.unswept()
