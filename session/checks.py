@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from session.errors import SessionError
+
 
 @dataclass(frozen=True)
 class Check:
@@ -18,6 +20,19 @@ class Check:
 
     name: str
     argv: tuple[str, ...]
+
+
+def require_checkout(folder: Path) -> None:
+    """Refuses to check an installation, which has no tests and lies among packages of others.
+
+    Raises:
+        SessionError: the folder is no checkout of the source.
+    """
+    if not ((folder / 'pyproject.toml').is_file() and (folder / 'test').is_dir()):
+        raise SessionError(
+            f'the trainer is installed in {folder}, without its tests: '
+            'run ./trainer test in a checkout of its source'
+        )
 
 
 def all_checks(pytest_arguments: Sequence[str]) -> list[Check]:

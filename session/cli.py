@@ -138,10 +138,11 @@ def run(context: typer.Context) -> None:
     context_settings={'allow_extra_args': True, 'ignore_unknown_options': True},
 )
 def test(context: typer.Context) -> None:
-    """Run all checks: lint, format, types, and the tests; arguments go to pytest."""
-    from session.checks import all_checks, run_checks, verdict
+    """Run all checks of a checkout: lint, format, types, tests; arguments go to pytest."""
+    from session.checks import all_checks, require_checkout, run_checks, verdict
 
     root = Path(__file__).resolve().parents[1]
+    require_checkout(root)
     console = Console(stderr=True)
     results = run_checks(
         all_checks(context.args), root, lambda name: console.rule(name, align='left')

@@ -66,6 +66,8 @@ def run_demo(options: DemoOptions) -> Status:
     console, notes = Console(), Console(stderr=True)
     with reserved_domain(options.domain) as domain:
         outcome = _run(nodes, seconds, bag, domain, notes)
+    if outcome.interrupted and not outcome.deaths:
+        notes.print(f'interrupted (exit status {int(Status.INTERRUPTED)})', highlight=False)
     if not outcome.ran:
         return _not_run(outcome, bag, notes)
     try:
@@ -107,16 +109,31 @@ def _duration(scene: Scene, asked: float | None) -> float:
     return seconds
 
 
-def _new_bag(folder: Path | None, scene: str) -> Path:
-    if folder is None:
+def _new_bag(asked: Path | None, scene: str) -> Path:
+    """Where the recorder will make the bag, refused where it could not."""
+    if asked == Path():
+        raise SessionError('--bag names no folder: give the path of a new one')
+    if asked is None:
         folder = SESSIONS / f'{scene}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}'
-        SESSIONS.mkdir(parents=True, exist_ok=True)
-    folder = folder.resolve()
-    if folder.exists():
-        raise SessionError(f'{folder} exists already: name a new folder for the bag')
-    if not folder.parent.is_dir():
-        raise SessionError(f'{folder.parent} does not exist: make it first, the bag goes into it')
-    return folder
+    else:
+        folder = asked.resolve()
+        if folder.parent.exists() and not folder.parent.is_dir():
+            raise SessionError(f'{folder.parent} is a file: name a folder that the bag can go into')
+        if not folder.parent.exists():
+            raise SessionError(
+                f'{folder.parent} does not exist: make it first, the bag goes into it'
+            )
+    try:
+        folder.mkdir(parents=asked is None)
+        folder.rmdir()
+    except FileExistsError:
+        raise SessionError(f'{folder} exists already: name a new folder for the bag') from None
+    except OSError as error:
+        why = (error.strerror or str(error)).lower()
+        raise SessionError(
+            f'{folder} cannot be made ({why}): name another folder for the bag'
+        ) from None
+    return folder.resolve()
 
 
 def _run(

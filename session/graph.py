@@ -40,7 +40,8 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
     commands = []
     for name, module in MODULES.items():
         parameters = {'scene': str(scene), 'seed': seed, **own.get(name, {})}
-        argv = [sys.executable, '-m', module, '--ros-args']
+        # What a node says goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
+        argv = [sys.executable, '-m', module, '--ros-args', '--disable-external-lib-logs']
         for key, value in parameters.items():
             argv += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False)}']
         records = name == RECORDER_NODE

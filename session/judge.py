@@ -40,7 +40,8 @@ def judge(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
         *(death.sentence for death in outcome.deaths),
         *(f'{name} had to be killed at the end' for name in outcome.killed),
         *_bag(summary),
-        *_nodes(summary, expected),
+        *_errors(summary),
+        *([] if outcome.interrupted else _rates(summary, expected)),
         *([] if outcome.interrupted else _touch(summary, outcome, expected)),
     ]
 
@@ -54,7 +55,7 @@ def _bag(summary: Summary) -> list[str]:
     return failures
 
 
-def _nodes(summary: Summary, expected: Expected) -> list[str]:
+def _rates(summary: Summary, expected: Expected) -> list[str]:
     failures = []
     for name, nominal in expected.rates.items():
         node = summary.nodes.get(name)
@@ -64,10 +65,15 @@ def _nodes(summary: Summary, expected: Expected) -> list[str]:
             failures.append(f'{name} never reported its rate on /diagnostics')
         elif abs(node.rate - nominal) > RATE_TOLERANCE * nominal:
             failures.append(f'{name} ran at {node.rate:.4g} Hz instead of {nominal:g} Hz')
-    for node in summary.nodes.values():
-        if node.worst_level == ERROR_LEVEL:
-            failures.append(f'{node.name} reported an error: {node.message}')
     return failures
+
+
+def _errors(summary: Summary) -> list[str]:
+    return [
+        f'{node.name} reported an error: {node.message}'
+        for node in summary.nodes.values()
+        if node.worst_level == ERROR_LEVEL
+    ]
 
 
 def _touch(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:

@@ -13,6 +13,8 @@ from session.node_process import NodeCommand, NodeProcess, is_warning
 STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 POLL = 0.05  # [s]
 MOST_SHOWN = 20
+HURRY = 1.0
+"""What is left to the nodes [s] when the user interrupts again."""
 ASKED_FOR = (0, -signal.SIGINT, -signal.SIGTERM)
 
 
@@ -59,7 +61,7 @@ class Outcome:
         seconds: [s] from the last node being ready to the end.
         deaths: of nodes, in order.
         unready: sentence about who was not ready in time.
-        killed: nodes that did not end when asked to.
+        killed: nodes that did not end when asked to, in all the time that they have for it.
     """
 
     ran: bool = False
@@ -75,9 +77,9 @@ class Supervisor:
     """Runs a set of nodes to the end of a session; use it as a context manager.
 
     Everything happens in the calling thread, which must be the main one: the kernel ties the life
-    of the processes to it. SIGINT, SIGTERM and SIGHUP end the session in order; a second one kills
-    what has not ended by then, except nodes that record. Each node has a process group of its own,
-    so that a terminal's Ctrl-C reaches the supervisor alone.
+    of the processes to it. SIGINT, SIGTERM and SIGHUP end the session in order; after a second one
+    what has not ended within a second is killed, except nodes that record. Each node has a process
+    group of its own, so that a terminal's Ctrl-C reaches the supervisor alone.
 
     Args:
         commands: the nodes in the order in which they are ended, those that record last.
@@ -262,21 +264,30 @@ class Supervisor:
             node.asked_to_end = True
             node.send(signal.SIGINT)
         asked = time.monotonic()
+        hurried = float('inf')
         terminated: set[str] = set()
         while remaining := [node for node in remaining if node.alive]:
-            waited = time.monotonic() - asked
+            now = time.monotonic()
+            if self._interrupts > patience:
+                hurried = min(hurried, now)
             for node in remaining:
-                grace = node.command.grace
-                hurry = self._interrupts > patience and not node.command.records
-                if hurry or waited > 1.5 * grace:
-                    self.outcome.killed.append(node.name)
-                    self._tell(Event('killed', node.name, f'{node.name} does not end: killed'))
-                    node.send_group(signal.SIGKILL)
-                    node.process.wait()
+                grace, waited = node.command.grace, now - asked
+                too_long = waited > 1.5 * grace
+                if too_long or (now - hurried > HURRY and not node.command.records):
+                    self._kill(node, expected=not too_long)
                 elif waited > grace and node.name not in terminated:
                     terminated.add(node.name)
                     node.send(signal.SIGTERM)
             self._poll(POLL / 5)
+
+    def _kill(self, node: NodeProcess, *, expected: bool) -> None:
+        """Kills a node that does not end; in a hurry that is no failure of its own."""
+        if not expected:
+            self.outcome.killed.append(node.name)
+        what = 'has not ended yet' if expected else 'does not end'
+        self._tell(Event('killed', node.name, f'{node.name} {what}: killed'))
+        node.send_group(signal.SIGKILL)
+        node.process.wait()
 
 
 def describe(returncode: int) -> str:

@@ -1,5 +1,6 @@
 """The command line: every command explains itself, and every mistake is one line."""
 
+import errno
 import json
 import os
 import re
@@ -79,18 +80,43 @@ def test_mistake_in_a_scene_is_told_with_its_line(
     assert str(scene) in line and 'did you mean seconds?' in line
 
 
-def test_bag_folder_that_exists_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.parametrize(
+    ('option', 'value', 'says'),
+    [
+        ('--scene', '', ["scene '' is not known", 'give the path of a .yaml file']),
+        ('--scene', '{}/folder.yaml', ['is a folder', 'name the file in it']),
+        ('--scene', '{}/words.yaml', ['words.yaml:2', 'not valid YAML', 'check indentation']),
+        ('--scene', '{}/no_mesh.yaml', ['nix.msh does not exist', 'check the path']),
+        ('--bag', '', ['--bag names no folder', 'give the path']),
+        ('--bag', '{}/folder.yaml', ['exists already', 'name a new folder']),
+        ('--bag', '{}/no/bag', ['no does not exist', 'make it first']),
+        ('--bag', '{}/words.yaml/bag', ['words.yaml is a file', 'name a folder']),
+        ('--bag', '/proc/bag', ['/proc/bag cannot be made', 'name another folder']),
+        ('--bag', '{}/' + 'x' * 300, ['cannot be made (file name too long)', 'name another']),
+    ],
+)
+def test_scene_or_bag_that_cannot_be_is_refused_in_one_sentence_with_a_remedy(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, option: str, value: str, says: list[str]
 ) -> None:
-    assert trainer('demo', '--bag', str(tmp_path)) == Status.BAD_INPUT
-    assert f'{tmp_path} exists already' in one_error_line(capsys)
+    (tmp_path / 'folder.yaml').mkdir()
+    (tmp_path / 'words.yaml').write_text('tissue: [a\n')
+    (tmp_path / 'no_mesh.yaml').write_text('tissue: {mesh: nix.msh}\n')
+    assert trainer('demo', '--domain', 'free', option, value.format(tmp_path)) == Status.BAD_INPUT
+    line = one_error_line(capsys)
+    assert all(words in line for words in says), line
 
 
-def test_bag_in_a_folder_that_is_not_there_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+def test_folder_that_may_not_be_written_is_refused_before_a_node_starts(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert trainer('demo', '--bag', str(tmp_path / 'no' / 'bag')) == Status.BAD_INPUT
-    assert f'{tmp_path / "no"} does not exist' in one_error_line(capsys)
+    def refuse(folder: Path, **_: object) -> None:
+        raise PermissionError(errno.EACCES, 'Permission denied', str(folder))
+
+    monkeypatch.setattr(Path, 'mkdir', refuse)
+    assert trainer('demo', '--bag', str(tmp_path / 'bag')) == Status.BAD_INPUT
+    assert 'bag cannot be made (permission denied)' in one_error_line(capsys)
+    assert trainer('demo') == Status.BAD_INPUT
+    assert 'cannot be made (permission denied)' in one_error_line(capsys)
 
 
 @pytest.mark.parametrize('seconds', ['0', '-3', 'nan', 'inf', '1e9'])
@@ -152,6 +178,14 @@ def test_test_command_runs_every_check_and_has_the_status_of_the_first_that_fail
     assert announced == ['lint', 'types', 'tests']
     assert verdict(results) == (7, 'failed: types, tests')
     assert verdict({'lint': 0, 'tests': 0}) == (0, 'all passed: lint, tests')
+
+
+def test_test_command_of_an_installation_says_that_the_tests_are_in_the_source(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, '__file__', str(tmp_path / 'session' / 'cli.py'))
+    assert trainer('test') == Status.BAD_INPUT
+    assert 'in a checkout of its source' in one_error_line(capsys)
 
 
 def test_extra_arguments_of_the_test_command_reach_pytest() -> None:

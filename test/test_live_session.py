@@ -212,6 +212,7 @@ def assert_nothing_left(session: LiveSession) -> None:
     assert session.end() == Status.INTERRUPTED, session.said
     assert not session.running()
     assert 'Traceback' not in session.said
+    assert 'interrupted (exit status 130)' in session.said
     if list(session.bag.glob('*.mcap')):
         with AnyReader([session.bag]) as reader:
             assert sum(1 for _ in reader.messages()) == reader.message_count

@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -73,14 +74,21 @@ def test_script_that_never_ends_is_a_failure(
 
 @pytest.mark.usefixtures('perfect')
 def test_interrupted_session_still_has_its_table(
-    run: Run, capsys: pytest.CaptureFixture[str]
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    timer = threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
+    def interrupt() -> None:
+        ledger = tmp_path / 'ledger'
+        while not ledger.exists() or ledger.read_text().count('start') < len(MODULES):
+            time.sleep(0.01)
+        time.sleep(1.0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
     assert run() == Status.INTERRUPTED
     captured = capsys.readouterr()
     assert 'elements cut' in captured.out
     assert 'not as it should be' not in captured.err
+    assert 'interrupted (exit status 130)' in captured.err
 
 
 def test_session_without_a_readable_bag_is_a_failure(

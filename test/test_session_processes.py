@@ -239,7 +239,7 @@ LAUNCHER = """
             print('running', flush=True)
             supervisor.run(60.0)
         outcome = supervisor.end()
-    print('over', *outcome.deaths, flush=True)
+    print('over', *outcome.deaths, *outcome.killed, flush=True)
     sys.exit(130 if outcome.interrupted else 0)
 """
 
@@ -307,6 +307,7 @@ def test_second_interrupt_kills_the_slow_but_lets_the_recorder_finish(ledger: Le
     wait_for(lambda: len(ledger.entries('SIGINT')) == 2)
     assert len(ledger.running()) == 3
     group_interrupt(launcher)
+    wait_for_line(launcher, 'killed')
     wait_for(lambda: ledger.running() == ['recorder'])
     wait_for(lambda: dict(ledger.entries('SIGINT')).get('recorder'))
     group_interrupt(launcher)
@@ -318,8 +319,23 @@ def test_second_interrupt_kills_the_slow_but_lets_the_recorder_finish(ledger: Le
         if line.startswith('start recorder')
     )
     os.kill(recorder, signal.SIGKILL)
+    assert launcher.stdout is not None
+    assert launcher.stdout.read().splitlines()[-1] == 'over'
     assert launcher.wait(10) == 130
     assert not ledger.running()
+
+
+def test_node_that_ends_soon_after_a_second_interrupt_is_not_killed(ledger: Ledger) -> None:
+    launcher = launch(ledger, 'slow')
+    wait_for_line(launcher, 'running')
+    group_interrupt(launcher)
+    wait_for(lambda: ledger.entries('SIGINT'))
+    group_interrupt(launcher)
+    assert launcher.stdout is not None
+    said = launcher.stdout.read()
+    assert launcher.wait(10) == 130
+    assert 'killed' not in said
+    assert len(ledger.entries('end')) == 3
 
 
 def test_nothing_survives_a_killed_launcher_and_the_recorder_may_close_its_bag(

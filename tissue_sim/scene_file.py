@@ -83,11 +83,12 @@ def read_section(path: Path, section: str, model: type[M]) -> M:
 def missing_file(path: Path) -> str:
     """Says that a file is not there, with the nearest name among its neighbours."""
     if path.is_dir():
-        return f'{path} is a folder, not a file'
+        return f'{path} is a folder: name the file in it'
     if not path.parent.is_dir():
-        return f'{path} does not exist, nor does its folder {path.parent}'
-    near = nearest(path.name, (entry.name for entry in path.parent.iterdir()))
-    return f'{path} does not exist' + (f': did you mean {near}?' if near else '')
+        return f'{path} does not exist, nor does its folder {path.parent}: check the path'
+    alike = (e.name for e in path.parent.iterdir() if e.suffix == path.suffix and e.is_file())
+    near = nearest(path.name, alike)
+    return f'{path} does not exist: ' + (f'did you mean {near}?' if near else 'check the path')
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
