@@ -11,7 +11,8 @@ from cutting.cases import NAMES
 from cutting.fragments import small_pieces
 from cutting.lookup import BLOCKED, DONE, EDGES, PENDING, Tables, edge_key, find_edge, with_room
 from cutting.method import CASES, Report
-from cutting.snapping import slides
+from cutting.sliding import slides
+from cutting.snapping import Limits
 from cutting.stars import Patch, cut_area, lay_patch, nodes_concerned, split_stars
 from cutting.state_table import (
     adopt,
@@ -40,6 +41,9 @@ class Scheme:
 
     Attributes:
         tau: a crossing nearer to a node than this share of its edge goes to the node.
+        tau_held: the same for a node that cannot slide onto the surface.
+        shape: how far a sliding node may leave the tissue's surface, as a share of the median
+            altitude at the start.
         floor: smallest altitude of a new element, as a share of the median altitude at the start.
         true_points: new nodes at the true crossings, else at midpoints and centroids.
         slides: snapped nodes move onto the swept surface.
@@ -48,6 +52,8 @@ class Scheme:
     """
 
     tau: float = 0.3
+    tau_held: float = 0.12
+    shape: float = 0.05
     floor: float = 0.02
     true_points: bool = True
     slides: bool = True
@@ -81,7 +87,7 @@ def build_batch(
     tables: Tables,
     active: np.ndarray,
     scheme: Scheme,
-    floor: float,
+    limits: Limits,
 ) -> Batch:
     """Makes the batch of all crossings that the blade has left.
 
@@ -91,7 +97,7 @@ def build_batch(
         tables: of the stroke; they follow as if the batch were applied.
         active: nodes of the tetrahedra that the blade is in, shape (a, 4).
         scheme: of the method.
-        floor: altitude that no new element falls below [m].
+        limits: of the mesh.
 
     Raises:
         CutStateError: an element is in a state that no table knows, or would be turned over.
@@ -111,9 +117,9 @@ def build_batch(
     parents = parents_concerned(links, tables, edges, nodes)
     moves = _Moves(np.zeros(0, np.int64), np.zeros((0, 3)))
     if scheme.slides:
-        moves = _Moves(*slides(nodes, links, tables, mesh.rest, floor))
+        moves = _Moves(*slides(nodes, links, tables, mesh.rest, mesh.fixed, limits))
     pieces, moves, worst = _sound_pieces(
-        mesh, positions, tables, parents, edges, moves, scheme, floor
+        mesh, positions, tables, parents, edges, moves, scheme, limits.floor
     )
     return _assemble(mesh, positions, tables, edges, nodes, parents, pieces, moves, worst)
 
@@ -246,9 +252,7 @@ def _delta(
 ) -> TopologyDelta:
     n = mesh.node_count
     moved = tables.node_id[moves.rows]
-    share = tables.slide[moves.rows, :1]
-    where_parents = np.stack([moved, tables.slide_to[moves.rows], moved, moved], axis=1)
-    where_weights = np.concatenate([1 - share, share, 0 * share, 0 * share], axis=1)
+    where_parents, where_weights = tables.slide_to[moves.rows], tables.slide[moves.rows]
     copy_parents = np.repeat(copies[:, None], 4, axis=1)
     copy_weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(copies), 1))
     for k, source in enumerate(copies.tolist()):

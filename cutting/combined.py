@@ -10,7 +10,7 @@ from cutting.geometry import smallest_altitudes
 from cutting.lookup import NODES, clear, empty_tables, with_room
 from cutting.method import CutResult, check_sweep
 from cutting.propagation import quad
-from cutting.snapping import conflicts, register
+from cutting.snapping import Limits, Stroke, conflicts, register
 from cutting.state_table import active_list, pending
 from tissue_sim.blade import Sweep
 from tissue_sim.mesh import TetMesh
@@ -77,9 +77,7 @@ class CombinedMethod:
             if not folded:
                 self._queue.pop(0)
         active = self._active[:0] if finish or folded else self._active
-        batch = build_batch(
-            mesh, positions, self._tables, active, self._scheme, self._scheme.floor * self._altitude
-        )
+        batch = build_batch(mesh, positions, self._tables, active, self._scheme, self._limits())
         self._tables = batch.tables
         if folded:
             warnings.append(FOLDED)
@@ -137,15 +135,28 @@ class CombinedMethod:
             edges=len(nodes),
             parents=0,
         )
-        limits = np.array(
-            [self._scheme.tau, _ROOM_FOR_CHILDREN * self._scheme.floor * self._altitude]
+        limits = self._limits()
+        register(
+            nodes,
+            data,
+            Stroke(direction, links, tables, positions, mesh.rest, mesh.fixed, limits),
         )
-        register(nodes, data, direction, links, tables, positions, mesh.rest, mesh.fixed, limits)
         if not self._scheme.subdivides:
             give_up_edges(tables)
         self._tables = tables
         self._active = active_list(corners[3], corners[2], links, tables, positions, met)
         return len(met), False
+
+    def _limits(self) -> Limits:
+        scheme = self._scheme
+        floor = scheme.floor * self._altitude
+        return Limits(
+            tau=scheme.tau,
+            tau_held=scheme.tau_held if scheme.slides else scheme.tau,
+            small=_ROOM_FOR_CHILDREN * floor,
+            floor=floor,
+            shape=scheme.shape * self._altitude,
+        )
 
     def _turn(self, triangles: np.ndarray, corners: np.ndarray) -> None:
         """Lets the normal of the stroke follow its sweeps, with a memory of about one element."""

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from cutting.geometry import EDGE_NODES, orientation
+from cutting.geometry import EDGE_NODES, height, orientation
 from cutting.lookup import base_of, edge_key, edge_slot, is_on_cut
 from tissue_sim.topology import FACE_NODES
 
@@ -44,11 +44,6 @@ def _normals(triangles):
 
 
 @njit(cache=True)
-def _height(n, a, x):
-    return n[0] * (x[0] - a[0]) + n[1] * (x[1] - a[1]) + n[2] * (x[2] - a[2])
-
-
-@njit(cache=True)
 def _inside(triangle, n, x, slack):
     """Whether a point of the triangle's plane is inside it, or within `slack` of its border [m]."""
     for i in range(3):
@@ -68,9 +63,9 @@ def _near(triangle, n, slack, positions, corners):
     """
     above = below = False
     for k in range(4):
-        height = _height(n, triangle[0], positions[corners[k]])
-        above |= height >= -slack
-        below |= height <= slack
+        at = height(n, triangle[0], positions[corners[k]])
+        above |= at >= -slack
+        below |= at <= slack
     if not (above and below):
         return False
     for i in range(3):
@@ -230,7 +225,7 @@ def _crossing(triangle, n, extent, positions, a, b, near, x):
     """
     p, q = positions[a], positions[b if b != a else near]
     slack = 1e-6 * extent
-    above, below = _height(n, triangle[0], p), _height(n, triangle[0], q)
+    above, below = height(n, triangle[0], p), height(n, triangle[0], q)
     length = np.sqrt((q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2)
     if a == b:
         x[:] = p

@@ -12,6 +12,16 @@ EDGE_NODES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
 @njit(cache=True)
+def height(normal, point, x):
+    """Height of x above the plane through a point with that normal, each shape (3,)."""
+    return (
+        normal[0] * (x[0] - point[0])
+        + normal[1] * (x[1] - point[1])
+        + normal[2] * (x[2] - point[2])
+    )
+
+
+@njit(cache=True)
 def orientation(a, b, c, d):
     """Six times the signed volume of the tetrahedron a b c d [m^3], each shape (3,)."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]

@@ -36,8 +36,10 @@ class Tables(NamedTuple):
         node_side: MINUS, PLUS or SNAPPED, shape (a,).
         node_state: of a snapped node: 0, PENDING or DONE, shape (a,).
         node_plane: normal of the swept surface and height of the node above it [m], shape (a, 4).
-        slide_to: node towards which a snapped node slides onto the surface, or -1, shape (a,).
-        slide: how far, as a share of the edge, and in length [m], shape (a, 2).
+        node_near: length from a snapped node to the nearest crossing of its edges [m], shape (a,).
+        rest_plane: the same surface in the rest shape: normal, height of the node above it [m],
+            shape (a, 4).
+        slide_to, slide: nodes and weights of where a snapped node slides to, shape (a, 4).
         hash_key, hash_row: open addressing, low << 32 | high to row, shape (power of two,).
         edge_nodes: low, high, shape (b, 2).
         edge_share: where the blade crossed it, from low to high, shape (b,).
@@ -59,6 +61,8 @@ class Tables(NamedTuple):
     node_side: np.ndarray
     node_state: np.ndarray
     node_plane: np.ndarray
+    node_near: np.ndarray
+    rest_plane: np.ndarray
     slide_to: np.ndarray
     slide: np.ndarray
     hash_key: np.ndarray
@@ -87,8 +91,10 @@ def empty_tables() -> Tables:
         node_side=np.zeros(64, np.int8),
         node_state=np.zeros(64, np.int8),
         node_plane=np.zeros((64, 4)),
-        slide_to=np.zeros(64, np.int64),
-        slide=np.zeros((64, 2)),
+        node_near=np.zeros(64),
+        rest_plane=np.zeros((64, 4)),
+        slide_to=np.zeros((64, 4), np.int64),
+        slide=np.zeros((64, 4)),
         hash_key=np.full(256, -1, np.int64),
         hash_row=np.zeros(256, np.int64),
         edge_nodes=np.zeros((64, 2), np.int64),
@@ -114,7 +120,7 @@ def with_room(
         room[name] = grown(getattr(tables, name), mesh_nodes, fill=-1)
     room['owner'] = grown(tables.owner, tetrahedra, fill=-1)
     room['label'] = grown(tables.label, tetrahedra)
-    for name in ('node_id', 'node_side', 'node_state', 'node_plane', 'slide_to', 'slide'):
+    for name in ('node_id', 'node_side', 'node_state', 'node_plane', 'node_near', 'rest_plane', 'slide_to', 'slide'):
         room[name] = grown(getattr(tables, name), a)
     for name in ('edge_nodes', 'edge_share', 'edge_state', 'edge_normal'):
         room[name] = grown(getattr(tables, name), b)
@@ -198,11 +204,10 @@ def add_node(tables, node, side):
     tables.node_id[row] = node
     tables.node_side[row] = side
     tables.node_state[row] = 0
-    tables.slide_to[row] = -1
-    tables.slide[row, 0] = 0.0
-    tables.slide[row, 1] = np.inf
+    tables.node_near[row] = np.inf
     for i in range(4):
         tables.node_plane[row, i] = 0.0
+        tables.rest_plane[row, i] = 0.0
     return row
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from cutting.cases import CHILDREN, FRONT, INSIDE, LABEL_FACES, MID, NUMBER, ORDER, STATE
-from cutting.geometry import EDGE_NODES, altitude
+from cutting.geometry import EDGE_NODES, altitude, height
 from cutting.lookup import DONE, PENDING, SNAPPED, edge_key, find_edge, side_of
 from cutting.state_table import crossings_of
 from tissue_sim.topology import FACE_NODES
@@ -53,15 +53,6 @@ def id_order(base):
 
 
 @njit(cache=True)
-def _height(normal, point, x):
-    return (
-        normal[0] * (x[0] - point[0])
-        + normal[1] * (x[1] - point[1])
-        + normal[2] * (x[2] - point[2])
-    )
-
-
-@njit(cache=True)
 def _front_point(tables, positions, a, b, o, row, tau, centred, weights):
     """Weights of a, b, o for the end of the slit in their face, where only the edge a b is cut.
 
@@ -78,13 +69,13 @@ def _front_point(tables, positions, a, b, o, row, tau, centred, weights):
         return
     normal = tables.edge_normal[row]
     mid = (1.0 - share) * positions[a] + share * positions[b]
-    at_a, at_b = _height(normal, mid, positions[a]), _height(normal, mid, positions[b])
-    at_o = _height(normal, mid, positions[o])
+    at_a, at_b = height(normal, mid, positions[a]), height(normal, mid, positions[b])
+    at_o = height(normal, mid, positions[o])
     side = side_of(tables, o)
     with_a = side == side_of(tables, a) if side != 0 else at_o * at_a > 0.0
     # The surface parts one node from two: the corner, at whose edges it enters and leaves.
-    corner, height, enters = (b, at_b, 1.0 - share) if with_a else (a, at_a, share)
-    leaves = height / (height - at_o) if height * at_o < 0.0 else 0.5
+    corner, above, enters = (b, at_b, 1.0 - share) if with_a else (a, at_a, share)
+    leaves = above / (above - at_o) if above * at_o < 0.0 else 0.5
     crossing = find_edge(tables, corner, o)
     if crossing >= 0 and tables.edge_state[crossing] == PENDING:
         leaves = tables.edge_share[crossing] if corner < o else 1.0 - tables.edge_share[crossing]
