@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from cutting.geometry import altitude, height
-from cutting.lookup import base_of, is_on_cut
+from cutting.lookup import SNAPPED, base_of
 from tissue_sim.topology import CUT
 
 _LEAST_ALTITUDE_LEFT = 0.4
@@ -253,11 +253,22 @@ def stays_sound(star, target, rest, floor, at, where):
 
 
 @njit(cache=True)
-def can_slide(star, plane, links, rest, fixed, shape, floor):
-    """Whether a node could slide onto the swept surface, as the mesh is now."""
+def can_slide(star, plane, links, tables, rest, fixed, shape, floor):
+    """Whether a node could slide onto the swept surface, when the snapped nodes around it do."""
     at: dict[int, int] = {}
-    where = np.empty((0, 3))
     at[-1] = 0
+    where = np.empty((3 * len(star), 3))
+    count = 0
+    for k in range(len(star)):
+        for i in range(1, 4):
+            node = star[k, i]
+            row = tables.node_row[node]
+            if row >= 0 and node not in at and tables.node_side[row] == SNAPPED:
+                at[node] = count
+                there = tables.rest_plane[row]
+                for j in range(3):
+                    where[count, j] = rest[node, j] - there[3] * there[j]
+                count += 1
     way = np.empty(3)
     if not find_way(star, plane, links, rest, fixed, shape, at, where, way):
         return False
@@ -265,24 +276,22 @@ def can_slide(star, plane, links, rest, fixed, shape, floor):
 
 
 @njit(cache=True)
-def _express(star, target, tables, fresh, rest, nodes, weights):
-    """Nodes and weights for a place, in the element around its first node that it is in most.
+def _express(node, target, links, rest, nodes, weights):
+    """Nodes and weights for a place, in the tetrahedron at a node that it is in, or beyond, most.
 
-    Elements at nodes that were duplicated before are of no use.
+    Returns:
+        Whether it is in or near the cone of one.
     """
+    tetrahedra, corner_next = links.tetrahedra, links.corner_next
     best = _BEYOND
-    o = rest[star[0, 0]]
+    o = rest[node]
     x, y, z = target[0] - o[0], target[1] - o[1], target[2] - o[2]
-    for k in range(len(star)):
-        usable = True
-        for i in range(1, 4):
-            row = tables.node_row[star[k, i]]
-            usable &= row in fresh or not is_on_cut(
-                tables.node_row, tables.node_side, tables.node_state, star[k, i]
-            )
-        if not usable:
-            continue
-        a, b, c = rest[star[k, 1]], rest[star[k, 2]], rest[star[k, 3]]
+    corner = links.first_corner[node]
+    while corner >= 0:
+        tet, i = corner // 4, corner % 4
+        corner = corner_next[corner]
+        j, k, m = tetrahedra[tet, i ^ 1], tetrahedra[tet, i ^ 2], tetrahedra[tet, i ^ 3]
+        a, b, c = rest[j], rest[k], rest[m]
         ax, ay, az = a[0] - o[0], a[1] - o[1], a[2] - o[2]
         bx, by, bz = b[0] - o[0], b[1] - o[1], b[2] - o[2]
         cx, cy, cz = c[0] - o[0], c[1] - o[1], c[2] - o[2]
@@ -296,7 +305,7 @@ def _express(star, target, tables, fresh, rest, nodes, weights):
         least = min(p, q, r)
         if least > best:
             best = least
-            nodes[:] = star[k]
+            nodes[0], nodes[1], nodes[2], nodes[3] = node, j, k, m
             weights[1] = p if abs(p) > 1e-12 else 0.0
             weights[2] = q if abs(q) > 1e-12 else 0.0
             weights[3] = r if abs(r) > 1e-12 else 0.0
@@ -324,7 +333,6 @@ def slides(rows, links, tables, rest, fixed, limits):
     at: dict[int, int] = {}
     at[-1] = 0
     count = 0
-    fresh = set(rows)
     way, target = np.empty(3), np.empty(3)
     for row in rows:
         plane = tables.rest_plane[row]
@@ -335,7 +343,7 @@ def slides(rows, links, tables, rest, fixed, limits):
         if not find_way(star, plane, links, rest, fixed, limits.shape, at, where, way):
             continue
         nodes, weights = tables.slide_to[row], tables.slide[row]
-        if not _express(star, rest[node] + way, tables, fresh, rest, nodes, weights):
+        if not _express(node, rest[node] + way, links, rest, nodes, weights):
             continue
         for i in range(3):
             target[i] = 0.0

@@ -139,7 +139,14 @@ def _is_near(node, point, stroke):
     plane = np.empty(4)
     rest_plane(star, stroke.direction, point, stroke.positions, stroke.rest, plane)
     return can_slide(
-        star, plane, stroke.links, stroke.rest, stroke.fixed, limits.shape, limits.floor
+        star,
+        plane,
+        stroke.links,
+        stroke.tables,
+        stroke.rest,
+        stroke.fixed,
+        limits.shape,
+        limits.floor,
     )
 
 
