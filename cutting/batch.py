@@ -41,8 +41,9 @@ class Scheme:
 
     Attributes:
         tau: a crossing nearer to a node than this share of its edge goes to the node.
-        tau_held: the same for a node that cannot slide onto the surface.
-        shape: how far a sliding node may leave the tissue's surface, as a share of the median
+        off: how far from the swept surface a node on the cut may stay that cannot slide onto it,
+            and
+        shape: how far a sliding node may leave the surface of the tissue, as shares of the median
             altitude at the start.
         floor: smallest altitude of a new element, as a share of the median altitude at the start.
         true_points: new nodes at the true crossings, else at midpoints and centroids.
@@ -51,9 +52,10 @@ class Scheme:
         least_share: new nodes keep away from the ends of an edge by this share.
     """
 
-    tau: float = 0.3
-    tau_held: float = 0.12
-    shape: float = 0.05
+    tau: float = 0.33
+    off: float = 0.2
+    thin: float = 0.06
+    shape: float = 0.1
     floor: float = 0.02
     true_points: bool = True
     slides: bool = True
@@ -115,11 +117,8 @@ def build_batch(
     )
     adopt(links, tables, members)
     parents = parents_concerned(links, tables, edges, nodes)
-    moves = _Moves(np.zeros(0, np.int64), np.zeros((0, 3)))
-    if scheme.slides:
-        moves = _Moves(*slides(nodes, links, tables, mesh.rest, mesh.fixed, limits))
     pieces, moves, worst = _sound_pieces(
-        mesh, positions, tables, parents, edges, moves, scheme, limits.floor
+        mesh, positions, tables, parents, edges, nodes, scheme, limits
     )
     return _assemble(mesh, positions, tables, edges, nodes, parents, pieces, moves, worst)
 
@@ -137,15 +136,17 @@ def _sound_pieces(
     tables: Tables,
     parents: np.ndarray,
     edges: np.ndarray,
-    moves: _Moves,
+    nodes: np.ndarray,
     scheme: Scheme,
-    floor: float,
+    limits: Limits,
 ) -> tuple[Pieces, _Moves, float]:
     """Divides the parents; where that falls below the floor, at midpoints, and if need be not at
     all.
     """
     front = scheme.tau if scheme.true_points else 0.5
     plain = np.zeros(0, np.int64)
+    sliding = nodes if scheme.slides else nodes[:0]
+    moves = _Moves(*slides(sliding, mesh.links, tables, mesh.rest, mesh.fixed, limits))
     for attempt in range(len(edges) + 2):
         pieces, unknown = subdivide(parents, mesh.links, tables, positions, mesh.rest, front, plain)
         if unknown >= 0:
@@ -153,11 +154,14 @@ def _sound_pieces(
                 f'the tetrahedron with nodes {tables.parent_nodes[unknown].tolist()} is crossed '
                 'in a way that is none of the cases A to H; abort the stroke'
             )
-        bad, worst = spoiled(pieces, tables, mesh.rest, moves.rows, moves.where, floor)
+        bad, worst = spoiled(pieces, tables, mesh.rest, moves.rows, moves.where, limits.floor)
         if len(bad) == 0:
             break
         if attempt == 0:
-            plain, moves = _soften(tables, bad, edges, moves)
+            plain = _soften(tables, bad, edges)
+            stay = np.isin(tables.node_id[sliding], tables.parent_nodes[bad])
+            rows = np.ascontiguousarray(sliding[~stay])
+            moves = _Moves(*slides(rows, mesh.links, tables, mesh.rest, mesh.fixed, limits))
         elif sum(block(tables, int(parent), edges) for parent in bad) == 0:
             break
     if len(pieces.corners) and worst <= 0.0:
@@ -165,21 +169,17 @@ def _sound_pieces(
     return pieces, moves, float(worst)
 
 
-def _soften(
-    tables: Tables, bad: np.ndarray, edges: np.ndarray, moves: _Moves
-) -> tuple[np.ndarray, _Moves]:
-    """Midpoints and centroids in some parents, whose nodes stay where they are."""
-    nodes = tables.parent_nodes[bad]
+def _soften(tables: Tables, bad: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Midpoints and centroids in some parents."""
     keys = []
-    for base in nodes.tolist():
+    for base in tables.parent_nodes[bad].tolist():
         for i, j in _PAIRS:
             row = find_edge(tables, base[i], base[j])
             if row >= 0 and tables.edge_state[row] == DONE:
                 keys.append(edge_key(base[i], base[j]))
                 if row in edges:
                     tables.edge_share[row] = 0.5
-    stay = ~np.isin(tables.node_id[moves.rows], nodes)
-    return np.array(keys, np.int64), _Moves(moves.rows[stay], moves.where[stay])
+    return np.array(keys, np.int64)
 
 
 def _assemble(

@@ -152,7 +152,8 @@ class CombinedMethod:
         floor = scheme.floor * self._altitude
         return Limits(
             tau=scheme.tau,
-            tau_held=scheme.tau_held if scheme.slides else scheme.tau,
+            off=scheme.off * self._altitude if scheme.slides else np.inf,
+            thin=scheme.thin * self._altitude,
             small=_ROOM_FOR_CHILDREN * floor,
             floor=floor,
             shape=scheme.shape * self._altitude,

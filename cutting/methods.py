@@ -12,7 +12,7 @@ def make_method(settings: CuttingSettings) -> CutMethod:
     floor = settings.altitude_floor
     match settings.method:
         case 'combined':
-            return CombinedMethod(Scheme(tau=settings.tau or 0.3, floor=floor))
+            return CombinedMethod(Scheme(tau=settings.tau or 0.33, floor=floor))
         case 'combined_midpoint':
             tau = settings.tau or 0.25
             return CombinedMethod(Scheme(tau=tau, floor=floor, true_points=False, slides=False))

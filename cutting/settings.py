@@ -21,7 +21,7 @@ class CuttingSettings(SceneModel):
         gt=0.0,
         lt=0.5,
         description='a crossing nearer to a node than this share of its edge goes to the node; by '
-        'default 0.3 for combined, 0.25 for combined_midpoint; other methods have no use for it',
+        'default 0.33 for combined, 0.25 for combined_midpoint; other methods have no use for it',
     )
     altitude_floor: float = Field(
         default=0.02,

@@ -11,6 +11,8 @@ _LEAST_ALTITUDE_LEFT = 0.4
 _FLAT = 1e-10
 _STEEPEST = 0.2
 """Least sine between the swept surface and what a node slides along."""
+_SMOOTH = 0.8
+"""Least cosine between the triangles at a node and the plane that touches the surface there."""
 _BEYOND = -0.3
 """Least weight of a node of the tetrahedron that a node slides into."""
 
@@ -107,7 +109,7 @@ def _put(x, node, rest, at, where):
 
 @njit(cache=True)
 def _volume_gradient(star, rest, at, where, out):
-    """Twice the outward area at a node: what it moves at right angles to this keeps the volume."""
+    """Twice the inward area at a node: what it moves at right angles to this keeps the volume."""
     a, b, c = np.empty(3), np.empty(3), np.empty(3)
     out[:] = 0.0
     for k in range(len(star)):
@@ -227,12 +229,16 @@ def find_way(star, plane, links, rest, fixed, shape, at, where, way):
         if _dot(turn, turn) > sharpest:
             sharpest = _dot(turn, turn)
             across[:] = turn
-    outward, tangent = np.empty(3), np.empty(3)
-    _volume_gradient(star, rest, at, where, outward)
-    share = _dot(outward, plane) / max(_dot(outward, outward), 1e-300)
+    inward, tangent = np.empty(3), np.empty(3)
+    _volume_gradient(star, rest, at, where, inward)
+    size = np.sqrt(_dot(inward, inward))
+    share = _dot(inward, plane) / max(size * size, 1e-300)
+    smooth = True
     for i in range(3):
-        tangent[i] = plane[i] - share * outward[i]
-    if _along(tangent, plane, way) and _keeps_shape(way, normals, shape):
+        tangent[i] = plane[i] - share * inward[i]
+    for k in range(len(normals)):
+        smooth &= _dot(normals[k], inward) < -_SMOOTH * size
+    if smooth and _along(tangent, plane, way) and _keeps_shape(way, normals, shape):
         return True
     return sharpest > 0.0 and _along(across, plane, way) and _keeps_shape(way, normals, 0.0)
 

@@ -28,14 +28,16 @@ class Limits(NamedTuple):
 
     Attributes:
         tau: a crossing nearer to a node than this share of its edge goes to the node.
-        tau_held: the same for a node that cannot slide onto the surface.
+        off: how far from the surface a node on the cut may stay that cannot slide onto it [m].
+        thin: no such node is left off the cut for an element that would be flatter than this [m].
         small: altitude of an element below which only nodes are cut [m].
         floor: smallest altitude of a new element [m].
         shape: how far a node may leave the surface of the tissue [m].
     """
 
     tau: float
-    tau_held: float
+    off: float
+    thin: float
     small: float
     floor: float
     shape: float
@@ -134,10 +136,12 @@ def _is_near(node, point, stroke):
     nearest, smallest = _nearness(star, point, stroke)
     if limits.tau == 0.5 or smallest < limits.small:
         return nearest <= 0.5
-    if nearest >= limits.tau or nearest <= limits.tau_held:
+    if nearest >= limits.tau or nearest == 0.0:
         return nearest < limits.tau
     plane = np.empty(4)
     rest_plane(star, stroke.direction, point, stroke.positions, stroke.rest, plane)
+    if abs(plane[3]) < limits.off or nearest * smallest < limits.thin:
+        return True
     return can_slide(
         star,
         plane,
