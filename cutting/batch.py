@@ -255,13 +255,11 @@ def _delta(
     where_parents, where_weights = tables.slide_to[moves.rows], tables.slide[moves.rows]
     copy_parents = np.repeat(copies[:, None], 4, axis=1)
     copy_weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(copies), 1))
-    for k, source in enumerate(copies.tolist()):
-        if source >= n:
-            copy_parents[k] = pieces.new_parents[source - n]
-            copy_weights[k] = pieces.new_weights[source - n]
-        elif source in moved:
-            j = int(np.flatnonzero(moved == source)[0])
-            copy_parents[k], copy_weights[k] = where_parents[j], where_weights[j]
+    new = copies >= n
+    copy_parents[new] = pieces.new_parents[copies[new] - n]
+    copy_weights[new] = pieces.new_weights[copies[new] - n]
+    row, slid = np.nonzero(copies[:, None] == moved)
+    copy_parents[row], copy_weights[row] = where_parents[slid], where_weights[slid]
     count = len(pieces.corners)
     stayed = patch.tetrahedra[changed]
     outer = outer_bits_of(mesh.links, stayed)

@@ -13,9 +13,11 @@ from cutting.propagation import quad
 from cutting.snapping import Limits, Stroke, conflicts, register
 from cutting.state_table import active_list, pending
 from tissue_sim.blade import Sweep
-from tissue_sim.mesh import TetMesh
+from tissue_sim.mesh import TetMesh, grown
 
 _ROOM_FOR_CHILDREN = 6.0
+_ENOUGH = 20000
+"""Elements that a median is taken of."""
 FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
 
 
@@ -40,6 +42,8 @@ class CombinedMethod:
         self._direction = np.zeros(3)
         self._active = np.zeros((0, 4), np.int64)
         self._located = False
+        self._seen = np.zeros(0, np.int64)
+        self._mark = 0
 
     def advance(self, mesh: TetMesh, positions: np.ndarray, sweep: Sweep) -> CutResult:
         """Cuts along a sweep, up to the elements that the blade is still in."""
@@ -98,11 +102,12 @@ class CombinedMethod:
             self._queue = queue
             warnings.append('the mesh changed within a stroke, which goes on as a new one')
         if self._altitude == 0.0:
-            self._altitude = float(np.median(smallest_altitudes(mesh.rest, mesh.tetrahedra)))
+            some = mesh.tetrahedra[:: 1 + len(mesh.tetrahedra) // _ENOUGH]
+            self._altitude = float(np.median(smallest_altitudes(mesh.rest, some)))
         self._tables = with_room(
             self._tables,
-            mesh_nodes=mesh.node_count,
-            tetrahedra=len(mesh.tetrahedra),
+            mesh_nodes=mesh.node_count + mesh.node_count // 4,
+            tetrahedra=len(mesh.tetrahedra) + len(mesh.tetrahedra) // 4,
             nodes=0,
             edges=0,
             parents=0,
@@ -120,7 +125,11 @@ class CombinedMethod:
         triangles = surfaces(corners)
         near = np.unique(self._active)
         links, tables = mesh.links, self._tables
-        met = met_tetrahedra(triangles, links, positions, near, not self._located)
+        self._mark += 1
+        self._seen = grown(self._seen, len(tables.owner))
+        met = met_tetrahedra(
+            triangles, links, positions, near, not self._located, self._seen, self._mark
+        )
         self._located |= len(met) > 0
         nodes, data = find_hits(triangles, links, tables, positions, met)
         self._turn(triangles, corners)

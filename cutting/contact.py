@@ -63,48 +63,96 @@ def _near(triangle, n, slack, positions, corners):
     """
     above = below = False
     for k in range(4):
-        at = height(n, triangle[0], positions[corners[k]])
+        node = corners[k]
+        at = (
+            n[0] * (positions[node, 0] - triangle[0, 0])
+            + n[1] * (positions[node, 1] - triangle[0, 1])
+            + n[2] * (positions[node, 2] - triangle[0, 2])
+        )
         above |= at >= -slack
         below |= at <= slack
     if not (above and below):
         return False
     for i in range(3):
-        low, high = np.inf, -np.inf
-        for k in range(4):
-            low = min(low, positions[corners[k], i])
-            high = max(high, positions[corners[k], i])
-        if min(triangle[0, i], triangle[1, i], triangle[2, i]) > high + slack:
+        a, b = positions[corners[0], i], positions[corners[1], i]
+        c, d = positions[corners[2], i], positions[corners[3], i]
+        if min(triangle[0, i], triangle[1, i], triangle[2, i]) > max(a, b, c, d) + slack:
             return False
-        if max(triangle[0, i], triangle[1, i], triangle[2, i]) < low - slack:
+        if max(triangle[0, i], triangle[1, i], triangle[2, i]) < min(a, b, c, d) - slack:
             return False
     return True
 
 
 @njit(cache=True)
-def _surface_seeds(triangles, slack, links, positions, seeds):
-    """Tetrahedra under surface triangles whose box meets the box of the sweep."""
-    low, high = np.empty(3), np.empty(3)
-    for i in range(3):
-        low[i] = triangles[:, :, i].min() - slack
-        high[i] = triangles[:, :, i].max() + slack
-    nodes = links.triangles
-    for k in range(links.counts[1]):
-        apart = False
-        for i in range(3):
-            a, b, c = (
-                positions[nodes[k, 0], i],
-                positions[nodes[k, 1], i],
-                positions[nodes[k, 2], i],
-            )
-            if min(a, b, c) > high[i] or max(a, b, c) < low[i]:
-                apart = True
-                break
-        if not apart:
-            seeds.append(np.int64(links.triangle_face[k] // 4))
+def _in_reach(triangles, normals, sizes, slack, positions, corners):
+    """Whether a sweep may cross a tetrahedron."""
+    for k in range(len(triangles)):
+        if sizes[k] > _SMALLEST and _near(triangles[k], normals[k], slack, positions, corners):
+            return True
+    return False
 
 
 @njit(cache=True)
-def met_tetrahedra(triangles, links, positions, near_nodes, everywhere):
+def _box(triangles, slack):
+    """Lower and upper corner of the box of a sweep [m], shape (2, 3)."""
+    box = np.empty((2, 3))
+    for i in range(3):
+        box[0, i] = triangles[:, :, i].min() - slack
+        box[1, i] = triangles[:, :, i].max() + slack
+    return box
+
+
+@njit(cache=True)
+def _surface_seeds(triangles, slack, links, positions, seeds, seen, mark):
+    """Tetrahedra under surface triangles whose box meets the box of the sweep."""
+    box = _box(triangles, slack)
+    nodes, face = links.triangles, links.triangle_face
+    for k in range(links.counts[1]):
+        a, b, c = nodes[k, 0], nodes[k, 1], nodes[k, 2]
+        apart = False
+        for i in range(3):
+            x, y, z = positions[a, i], positions[b, i], positions[c, i]
+            if min(x, y, z) > box[1, i] or max(x, y, z) < box[0, i]:
+                apart = True
+                break
+        tet = np.int64(face[k] // 4)
+        if not apart and seen[tet] != mark:
+            seen[tet] = mark
+            seeds.append(tet)
+
+
+@njit(cache=True)
+def _all_seeds(triangles, slack, links, positions, seeds, seen, mark):
+    """Tetrahedra whose box meets the box of the sweep, by the sides of it that nodes are on."""
+    box = _box(triangles, slack)
+    beyond = np.zeros(len(positions), np.uint8)
+    for node in range(len(positions)):
+        for i in range(3):
+            if positions[node, i] < box[0, i]:
+                beyond[node] |= np.uint8(1 << i)
+            elif positions[node, i] > box[1, i]:
+                beyond[node] |= np.uint8(8 << i)
+    nodes = links.tetrahedra
+    for tet in range(links.counts[0]):
+        a, b, c, d = nodes[tet, 0], nodes[tet, 1], nodes[tet, 2], nodes[tet, 3]
+        if beyond[a] & beyond[b] & beyond[c] & beyond[d] == 0:
+            seen[tet] = mark
+            seeds.append(np.int64(tet))
+
+
+@njit(cache=True)
+def _star_seeds(corner, corner_next, seeds, seen, mark):
+    """Tetrahedra around a node, by the head of its list of corners, that are not marked yet."""
+    while corner >= 0:
+        tet = np.int64(corner // 4)
+        if seen[tet] != mark:
+            seen[tet] = mark
+            seeds.append(tet)
+        corner = corner_next[corner]
+
+
+@njit(cache=True)
+def met_tetrahedra(triangles, links, positions, near_nodes, everywhere, seen, mark):
     """Tetrahedra that a sweep may cross: a few too many, never too few.
 
     From the stars of the nodes where the blade was, and from the surface, then from neighbour to
@@ -116,6 +164,7 @@ def met_tetrahedra(triangles, links, positions, near_nodes, everywhere):
         positions: current nodes [m], shape (n, 3).
         near_nodes: where the blade was, shape (k,).
         everywhere: begin from all tetrahedra.
+        seen, mark: scratch, shape (>= m,), and a number that is nowhere in it.
 
     Returns:
         Shape (t,).
@@ -124,38 +173,22 @@ def met_tetrahedra(triangles, links, positions, near_nodes, everywhere):
     slack = 0.0
     for i in range(3):
         slack = max(slack, 1e-6 * (triangles[:, :, i].max() - triangles[:, :, i].min()))
+    tetrahedra, first_corner, corner_next = links.tetrahedra, links.first_corner, links.corner_next
     queue = [np.int64(0) for _ in range(0)]
     if everywhere:
-        for each in range(links.counts[0]):
-            queue.append(np.int64(each))
+        _all_seeds(triangles, slack, links, positions, queue, seen, mark)
     else:
-        _surface_seeds(triangles, slack, links, positions, queue)
+        _surface_seeds(triangles, slack, links, positions, queue, seen, mark)
         for node in near_nodes:
-            corner = links.first_corner[node]
-            while corner >= 0:
-                queue.append(np.int64(corner // 4))
-                corner = links.corner_next[corner]
+            _star_seeds(first_corner[node], corner_next, queue, seen, mark)
     met = [np.int64(0) for _ in range(0)]
-    seen = set(queue)
-    tetrahedra, first_corner, corner_next = links.tetrahedra, links.first_corner, links.corner_next
     while len(queue) > 0:
         at = queue.pop()
-        near = False
-        for k in range(2):
-            near |= sizes[k] > _SMALLEST and _near(
-                triangles[k], normals[k], slack, positions, tetrahedra[at]
-            )
-        if not near:
+        if not _in_reach(triangles, normals, sizes, slack, positions, tetrahedra[at]):
             continue
         met.append(at)
         for i in range(4):
-            corner = first_corner[tetrahedra[at, i]]
-            while corner >= 0:
-                other = np.int64(corner // 4)
-                if other not in seen:
-                    seen.add(other)
-                    queue.append(other)
-                corner = corner_next[corner]
+            _star_seeds(first_corner[tetrahedra[at, i]], corner_next, queue, seen, mark)
     return np.array(met) if len(met) else np.zeros(0, np.int64)
 
 
@@ -187,10 +220,23 @@ def find_hits(triangles, links, tables, positions, met):
     tetrahedra, origin, owner = links.tetrahedra, tables.origin, tables.owner
     parent_nodes, hash_key = tables.parent_nodes, tables.hash_key
     row, side, state = tables.node_row, tables.node_side, tables.node_state
+    above = np.empty((2, 4))
     for tet in met:
         base_of(tetrahedra, origin, owner, parent_nodes, tet, base)
+        reach = 0.0
+        for i in range(4):
+            for axis in range(3):
+                reach += abs(positions[base[i], axis] - positions[base[0], axis])
+            for k in range(2):
+                above[k, i] = height(normals[k], triangles[k, 0], positions[base[i]])
         for pair in range(10):
             i, j = (EDGE_NODES[pair, 0], EDGE_NODES[pair, 1]) if pair < 6 else (pair - 6, pair - 6)
+            if pair < 6:
+                apart = above[0, i] * above[0, j] >= 0.0 and above[1, i] * above[1, j] >= 0.0
+            else:
+                apart = min(abs(above[0, i]), abs(above[1, i])) > _EXACT * reach
+            if apart:
+                continue
             a, b = min(base[i], base[j]), max(base[i], base[j])
             key = edge_key(a, b)
             if key in seen:

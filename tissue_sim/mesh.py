@@ -10,6 +10,7 @@ from tissue_sim.topology import (
     append_tetrahedra,
     remove_tetrahedra,
     renumber_node,
+    star_nodes,
 )
 
 
@@ -93,10 +94,13 @@ class TetMesh:
         self, rest: np.ndarray, tetrahedra: np.ndarray, fixed: np.ndarray | None = None
     ) -> None:
         self.node_count = len(rest)
-        self._rest = np.array(rest, float)
-        self._fixed = np.zeros(len(rest), np.uint8) if fixed is None else np.array(fixed, np.uint8)
-        m = len(tetrahedra)
-        self.links = _allocate(len(rest), m, 4 * m, 16 * m + 64)
+        # Spare room: the first cut of a large mesh does not have to move it all.
+        m, n = len(tetrahedra), len(rest) + len(rest) // 4
+        self._rest = grown(np.array(rest, float), n)
+        self._fixed = grown(
+            np.zeros(len(rest), np.uint8) if fixed is None else np.array(fixed, np.uint8), n
+        )
+        self.links = _allocate(n, m + m // 4, 4 * m, 16 * m + 64)
         order = np.ascontiguousarray(tetrahedra, np.int64)
         bad = append_tetrahedra(self.links, order, np.full(m, 15, np.uint8))
         if bad >= 0:
@@ -269,12 +273,12 @@ class TetMesh:
         tets = tets[tets < self.links.counts[0]]
         # Rows refer to a node by its number and to elements by their shape: where a node moves or
         # is renumbered, its whole star is touched.
-        renewed = {int(n) for n in moved} | {target for target, _ in renumbered}
-        stars = [
-            self.tetrahedra[self.star(node)].ravel() for node in renewed if node < self.node_count
-        ]
-        nodes = np.unique(np.concatenate([nodes, *stars]))
         targets = np.array([target for target, _ in renumbered], np.int64)
+        renewed = np.concatenate([moved, targets])
+        renewed = renewed[renewed < self.node_count]
+        links = self.links
+        stars = star_nodes(links.tetrahedra, links.first_corner, links.corner_next, renewed)
+        nodes = np.unique(np.concatenate([nodes, stars]))
         rest = np.unique(np.concatenate([np.arange(first_new, self.node_count), moved, targets]))
         return Touched(
             nodes=nodes[nodes < self.node_count],

@@ -211,14 +211,16 @@ class TensorMassModel:
         room += _SLACK
         start = np.concatenate([[0], np.cumsum(room)[:-1]])
         slots = int(room.sum())
+        # Spare room, which costs nothing until it is used: no cut has to move it all.
+        more, most = n + n // 4, 2 * slots
         self.tensors = Tensors(
-            np.zeros((n, 6)),
-            np.zeros(n),
-            start,
-            np.zeros(n, np.int64),
-            room,
-            np.zeros(slots, np.uint32),
-            np.zeros(9 * slots),
+            np.zeros((more, 6)),
+            np.zeros(more),
+            grown(start, more),
+            np.zeros(more, np.int64),
+            grown(room, more),
+            np.zeros(most, np.uint32),
+            np.zeros(9 * most),
         )
         self._used = slots
         self._gather(np.arange(n))

@@ -239,3 +239,16 @@ def renumber_node(links, source, target):
                         links.triangles[k, i] = target
                         _note(links, 2 * k + 1)
         corner = links.corner_next[corner]
+
+
+@njit(cache=True)
+def star_nodes(tetrahedra, first_corner, corner_next, nodes):
+    """Nodes of the tetrahedra around some nodes, with repeats, shape (s,)."""
+    found = [np.int64(0) for _ in range(0)]
+    for node in nodes:
+        corner = first_corner[node]
+        while corner >= 0:
+            for i in range(4):
+                found.append(np.int64(tetrahedra[corner // 4, i]))
+            corner = corner_next[corner]
+    return np.array(found)
