@@ -22,6 +22,26 @@ def lips(mesh: TetMesh) -> np.ndarray:
     return mesh.rest[mesh.triangles[mesh.triangle_kind == CUT]]
 
 
+def lip_area(mesh: TetMesh) -> float:
+    """Area of the triangles that cuts have opened at rest, one side [m^2]."""
+    corners = lips(mesh)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(np.linalg.norm(normals, axis=1).sum() / 4)
+
+
+def check_area(mesh: TetMesh, area: float) -> None:
+    """Checks that the lips have the area [m^2] that the reports add up to, to 1e-9.
+
+    Raises:
+        ViolationError: saying by how much they differ.
+    """
+    have = lip_area(mesh)
+    _claim(
+        abs(have - area) <= 1e-9 * max(have, area),
+        f'the lips have an area of {have:.9g} m^2, reported were {area:.9g} m^2',
+    )
+
+
 def check_mesh(
     mesh: TetMesh, volume: float, old_lips: np.ndarray | None = None, *, tolerance: float = 1e-12
 ) -> None:

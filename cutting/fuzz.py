@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cutting.checks import ViolationError, check_mesh, lips
+from cutting.checks import ViolationError, check_area, check_mesh, lip_area, lips
 from cutting.combined import FOLDED
 from cutting.geometry import smallest_altitudes
 from cutting.method import SweepError
@@ -145,8 +145,11 @@ def play(scene: Scene, method: str = 'combined') -> tuple[int, np.ndarray]:
             if not result.delta.empty:
                 batches += 1
                 volume -= result.report.removed_volume
+                area = lip_area(mesh) + result.report.area
                 tissue.apply(result.delta)
                 check_mesh(mesh, volume, old)
+                if method != 'delete':
+                    check_area(mesh, area)
             if FOLDED in result.report.warnings:
                 old = lips(mesh)
             tissue.move()
@@ -154,8 +157,11 @@ def play(scene: Scene, method: str = 'combined') -> tuple[int, np.ndarray]:
         cases += result.report.cases
         if not result.delta.empty:
             batches += 1
+            area = lip_area(mesh) + result.report.area
             tissue.apply(result.delta)
             check_mesh(mesh, volume, old)
+            if method != 'delete':
+                check_area(mesh, area)
     if len(mesh.tetrahedra) and (lowest := float(_altitudes(mesh).min())) < floor:
         raise ViolationError(f'an element has an altitude of {lowest:.3g} m, below {floor:.3g} m')
     return batches, cases

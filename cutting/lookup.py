@@ -120,7 +120,16 @@ def with_room(
         room[name] = grown(getattr(tables, name), mesh_nodes, fill=-1)
     room['owner'] = grown(tables.owner, tetrahedra, fill=-1)
     room['label'] = grown(tables.label, tetrahedra)
-    for name in ('node_id', 'node_side', 'node_state', 'node_plane', 'node_near', 'rest_plane', 'slide_to', 'slide'):
+    for name in (
+        'node_id',
+        'node_side',
+        'node_state',
+        'node_plane',
+        'node_near',
+        'rest_plane',
+        'slide_to',
+        'slide',
+    ):
         room[name] = grown(getattr(tables, name), a)
     for name in ('edge_nodes', 'edge_share', 'edge_state', 'edge_normal'):
         room[name] = grown(getattr(tables, name), b)

@@ -45,7 +45,8 @@ def star_of(node, links, tables):
         parent = np.int64(owner[tet])
         known = False
         for k in range(count):
-            known |= parent >= 0 and owners[k] == parent
+            if parent >= 0 and owners[k] == parent:
+                known = True
         if known:
             continue
         base = star[count]
@@ -102,9 +103,13 @@ def rest_plane(star, normal, point, positions, rest, out):
 
 @njit(cache=True)
 def _put(x, node, rest, at, where):
-    row = at[node] if node in at else -1
-    for i in range(3):
-        x[i] = where[row, i] if row >= 0 else rest[node, i]
+    if node in at:
+        row = at[node]
+        for i in range(3):
+            x[i] = where[row, i]
+    else:
+        for i in range(3):
+            x[i] = rest[node, i]
 
 
 @njit(cache=True)
@@ -125,8 +130,7 @@ def _volume_gradient(star, rest, at, where, out):
 
 @njit(cache=True)
 def _surface_normals(node, links, rest):
-    """Unit normals of the surface triangles at a node, and 1 for those of an earlier cut: (k, 4).
-    """
+    """Unit normals of the surface triangles at a node, then 1 for an earlier cut, shape (k, 4)."""
     first_corner, corner_next, face_triangle = (
         links.first_corner,
         links.corner_next,
@@ -151,7 +155,11 @@ def _surface_normals(node, links, rest):
                 vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
                 x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
                 size = np.sqrt(x * x + y * y + z * z)
-                normals[count, 0], normals[count, 1], normals[count, 2] = x / size, y / size, z / size
+                normals[count, 0], normals[count, 1], normals[count, 2] = (
+                    x / size,
+                    y / size,
+                    z / size,
+                )
                 normals[count, 3] = kind[k] == CUT
                 count += 1
         corner = corner_next[corner]

@@ -113,7 +113,13 @@ def run_comparison(folder: Path) -> None:
     console = Console(highlight=False)
     with console.status('') as line:
         rows, shown = compare(line.update)
-        write_all(folder, rows, shown, strokes()[0], rk4_milliseconds())
+        line.update('random planes')
+        planes = random_planes()
+        spreads = {
+            name: spread(tuple(stroke for stroke in planes if stroke.name == name))
+            for name in ('block', 'liver')
+        }
+        write_all(folder, rows, shown, strokes()[0], rk4_milliseconds(), spreads)
     console.print(f'{folder / "cut-methods.md"} has {len(rows)} rows')
 
 
@@ -154,6 +160,51 @@ def strokes() -> tuple[Stroke, ...]:
         Stroke('crossing', nodes, tetrahedra, free, (slant, across)),
         Stroke('liver', liver, inside.astype(np.int64), held.astype(np.uint8), (through,)),
     )
+
+
+def random_planes() -> tuple[Stroke, ...]:
+    """Planes of any direction through the block, 30, and through the liver, 12."""
+    found: list[Stroke] = []
+    liver, inside, _ = load_tissue(load_scene('liver').tissue)
+    for name, count in (('block', 30), ('liver', 12)):
+        for k in range(count):
+            rng = np.random.default_rng(k)
+            if name == 'block':
+                nodes, tetrahedra = good_block((8, 6, 6), _CELL, seed=k)
+            else:
+                nodes, tetrahedra = liver, inside.astype(np.int64)
+            low, high = nodes.min(axis=0), nodes.max(axis=0)
+            through = low + (high - low) * rng.uniform(0.3, 0.7, 3)
+            along, edge, _ = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+            line = through + np.linspace(-0.048, 0.048, 61)[:, None] * along
+            free = np.zeros(len(nodes), np.uint8)
+            path = drawn(line, (edge[0], edge[1], edge[2]), 0.048)
+            found.append(Stroke(name, nodes, tetrahedra, free, (path,)))
+    return tuple(found)
+
+
+def spread(strokes: tuple[Stroke, ...]) -> Floats:
+    """What `combined` makes of some strokes.
+
+    Returns:
+        By stroke: distance of the cut surface from the blade, root of the mean square and largest
+        [h], step shrink; shape (k, 3). Strokes that miss the tissue are left out.
+    """
+    found = []
+    for stroke in strokes:
+        mesh = cut(stroke, 'combined').mesh
+        if not len(lips(mesh)):
+            continue
+        before = TetMesh(stroke.nodes, stroke.tetrahedra, stroke.fixed)
+        distance, area = distances(mesh, stroke.paths, mean_edge(before))
+        shrink = _shrink(before, mesh)
+        found.append((np.sqrt(area @ distance**2 / area.sum()), distance.max(), shrink))
+    return np.array(found)
+
+
+def _shrink(before: TetMesh, after: TetMesh) -> float:
+    one, two = (highest_frequency(TensorMassModel(mesh, _TISSUE)) for mesh in (before, after))
+    return two / one
 
 
 def good_block(
@@ -251,7 +302,7 @@ def cut(stroke: Stroke, method: str) -> Cut:
     for path in stroke.paths:
         sweeps = [Sweep(*a, *b) for a, b in pairwise(path)]
         for sweep in [*sweeps, None]:
-            start = time.perf_counter()
+            start = time.thread_time()
             if sweep is None:
                 result = cutter.finish(mesh, mesh.rest)
             else:
@@ -260,11 +311,11 @@ def cut(stroke: Stroke, method: str) -> Cut:
                 continue
             touched = mesh.apply(result.delta)
             model.update(touched.nodes)
-            spent = time.perf_counter() - start
+            spent = time.thread_time() - start
             inverse = _inverse(model)
-            start = time.perf_counter()
+            start = time.thread_time()
             bound.update(touched.nodes, inverse)
-            milliseconds.append(1e3 * (spent + time.perf_counter() - start))
+            milliseconds.append(1e3 * (spent + time.thread_time() - start))
             elements += len(result.delta.removed_tetrahedra)
     return Cut(mesh, bound, milliseconds, elements)
 
@@ -287,7 +338,7 @@ def _row(stroke: Stroke, method: str, runs: list[Cut]) -> Row:
         float(distance.max()),
         len(before.tetrahedra),
         len(mesh.tetrahedra),
-        highest_frequency(model) / highest_frequency(TensorMassModel(before, _TISSUE)),
+        _shrink(before, mesh),
         100 * float(extra),
         100 * float(1 - mesh.volumes().sum() / before.volumes().sum()),
         int(pieces(mesh).max()) + 1,
@@ -361,7 +412,7 @@ def rk4_milliseconds() -> float:
     none, nowhere = np.zeros(0), np.zeros(3)
     spent = []
     for _ in range(30):
-        start = time.perf_counter()
+        start = time.thread_time()
         rk4_steps(
             model.operands,
             _inverse(model),
@@ -378,5 +429,5 @@ def rk4_milliseconds() -> float:
             nowhere,
             np.zeros(2),
         )
-        spent.append(1e3 * (time.perf_counter() - start))
+        spent.append(1e3 * (time.thread_time() - start))
     return median(spent)

@@ -38,14 +38,30 @@ is a block of {block} well-shaped tetrahedra (body-centred cubes, inner nodes di
   has; a stable step is shorter by so much. **added mass**: what the simulation adds to small nodes
   beyond a growth of {growth:g}, so that its step shrinks by no more than that.
 - **ms a batch**: cutting, adjacency, surface, tensors, masses and bound of the frequency together,
-  median and largest, each batch the best of {repeats} runs. **elements a batch**: tetrahedra taken
-  out or replaced, in the mean. In the same run one RK4 step of 10,000 tetrahedra took {rk4:.2f} ms.
+  in processor time, median and largest, each batch the best of {repeats} runs. **elements a
+  batch**: tetrahedra taken out or replaced, in the mean. In the same run one RK4 step of 10,000
+  tetrahedra took {rk4:.2f} ms: a batch of `combined` costs {ratio:.0f} of them.
+
+## Planes of any direction
+
+What `combined` makes of {planes} planes drawn at random through the same two tissues, right
+through: median / 90 % / largest. Some of them meet an edge of the tissue at a small angle: a node
+there can only slide along that edge, so it stays off the surface, or makes small elements.
+
+{spread}
 
 {verdict}
 """
 
 
-def write_all(folder: Path, rows: list[Row], shown: list[Cut], stroke: Stroke, rk4: float) -> None:
+def write_all(
+    folder: Path,
+    rows: list[Row],
+    shown: list[Cut],
+    stroke: Stroke,
+    rk4: float,
+    spreads: dict[str, NDArray[np.float64]],
+) -> None:
     """Writes the page, the table and the picture.
 
     Args:
@@ -54,6 +70,7 @@ def write_all(folder: Path, rows: list[Row], shown: list[Cut], stroke: Stroke, r
         shown: the first stroke as each method cut it.
         stroke: that stroke.
         rk4: milliseconds of the yardstick.
+        spreads: by tissue, what random planes came to, as from `compare_cuts.spread`.
     """
     (folder / 'images').mkdir(exist_ok=True)
     with (folder / 'cut-methods.csv').open('w', newline='') as out:
@@ -66,7 +83,10 @@ def write_all(folder: Path, rows: list[Row], shown: list[Cut], stroke: Stroke, r
         growth=GROWTH,
         repeats=REPEATS,
         rk4=rk4,
+        ratio=np.median([row.median_ms for row in rows if row.method == 'combined']) / rk4,
         verdict=verdict(rows),
+        planes=sum(map(len, spreads.values())),
+        spread=spread_table(spreads),
     )
     (folder / 'cut-methods.md').write_text(page)
     draw(shown, stroke, rows).savefig(folder / 'images' / 'cut-methods.png', dpi=130)
@@ -97,6 +117,19 @@ def table(rows: list[Row]) -> str:
     return '\n'.join(lines)
 
 
+def spread_table(spreads: dict[str, NDArray[np.float64]]) -> str:
+    """What random planes came to, as a table in Markdown."""
+    lines = ['| tissue | planes | distance, rms [h] | largest [h] | step shrink |']
+    lines.append('|---|---:|---:|---:|---:|')
+    for name, values in spreads.items():
+        columns = [
+            ' / '.join(f'{np.quantile(column, q):.{digits}f}' for q in (0.5, 0.9, 1.0))
+            for column, digits in zip(values.T, (4, 2, 1), strict=True)
+        ]
+        lines.append(f'| {name} | {len(values)} | {" | ".join(columns)} |')
+    return '\n'.join(lines)
+
+
 def verdict(rows: list[Row]) -> str:
     """One sentence on what the table shows."""
 
@@ -106,7 +139,7 @@ def verdict(rows: list[Row]) -> str:
 
     return (
         f'`combined` follows the blade to {span("combined", "rms_distance_h", ".3f")} h '
-        '(the most in the liver, on whose curved surface no node may slide), at a step '
+        '(the most on the arc, which flat triangles cannot follow), at a step '
         f'{span("combined", "step_shrink", ".1f")} times shorter; `separate` is off by '
         f'{span("separate", "rms_distance_h", ".2f")} h, `delete` loses '
         f'{span("delete", "lost_mass_percent", ".0f")} % of the tissue, and the slivers of '

@@ -46,7 +46,7 @@ def test_combined_parts_a_block_in_the_plane_of_the_blade(seed):
     assert abs(mesh.volumes().sum() / volume - 1) < 1e-12
     lip = mesh.rest[mesh.triangles[mesh.triangle_kind == 1]]
     twice = np.linalg.norm(np.cross(lip[:, 1] - lip[:, 0], lip[:, 2] - lip[:, 0]), axis=1).sum() / 2
-    assert area == pytest.approx(twice / 2, rel=0.01)
+    assert area == pytest.approx(twice / 2, rel=1e-9)
 
 
 @pytest.mark.parametrize('seed', range(3))
