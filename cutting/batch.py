@@ -45,6 +45,8 @@ class Scheme:
             and
         shape: how far a sliding node may leave the surface of the tissue, as shares of the median
             altitude at the start.
+        thin: no node is left off the cut for the sake of the surface where that would make an
+            element flatter than this share.
         floor: smallest altitude of a new element, as a share of the median altitude at the start.
         true_points: new nodes at the true crossings, else at midpoints and centroids.
         slides: snapped nodes move onto the swept surface.
