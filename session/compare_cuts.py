@@ -22,13 +22,14 @@ from cutting.settings import CuttingSettings
 from session.errors import SessionError
 from session.scene import load_scene
 from tissue_sim.blade import Sweep
-from tissue_sim.integrators import rk4_steps
+from tissue_sim.coupling import Coupling
+from tissue_sim.elasticity import ElasticModel
+from tissue_sim.integrators import Integrator
 from tissue_sim.locate import distance_to_triangles
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.mesh_io import load_tissue
 from tissue_sim.stability import FrequencyBound
-from tissue_sim.tensor_mass import TensorMassModel
 
 Floats = NDArray[np.float64]
 
@@ -203,7 +204,7 @@ def spread(strokes: tuple[Stroke, ...]) -> Floats:
 
 
 def _shrink(before: TetMesh, after: TetMesh) -> float:
-    one, two = (highest_frequency(TensorMassModel(mesh, _TISSUE)) for mesh in (before, after))
+    one, two = (highest_frequency(ElasticModel(mesh, _TISSUE)) for mesh in (before, after))
     return two / one
 
 
@@ -294,7 +295,7 @@ def drawn(line: Floats, edge: tuple[float, float, float], reach: float) -> Float
 def cut(stroke: Stroke, method: str) -> Cut:
     """Cuts a stroke by a method, with the physics following each batch."""
     mesh = TetMesh(stroke.nodes, stroke.tetrahedra, stroke.fixed)
-    model = TensorMassModel(mesh, _TISSUE)
+    model = ElasticModel(mesh, _TISSUE)
     bound = FrequencyBound(model, _inverse(model), GROWTH)
     cutter = make_method(CuttingSettings.model_validate({'method': method}))
     milliseconds: list[float] = []
@@ -310,7 +311,7 @@ def cut(stroke: Stroke, method: str) -> Cut:
             if result.delta.empty:
                 continue
             touched = mesh.apply(result.delta)
-            model.update(touched.nodes)
+            model.update(touched)
             spent = time.thread_time() - start
             inverse = _inverse(model)
             start = time.thread_time()
@@ -320,7 +321,7 @@ def cut(stroke: Stroke, method: str) -> Cut:
     return Cut(mesh, bound, milliseconds, elements)
 
 
-def _inverse(model: TensorMassModel) -> Floats:
+def _inverse(model: ElasticModel) -> Floats:
     return np.repeat(np.where(model.mesh.fixed == 1, 0.0, 1.0 / model.mass), 3)
 
 
@@ -328,7 +329,7 @@ def _row(stroke: Stroke, method: str, runs: list[Cut]) -> Row:
     before = TetMesh(stroke.nodes, stroke.tetrahedra, stroke.fixed)
     mesh, bound = runs[0].mesh, runs[0].bound
     distance, area = distances(mesh, stroke.paths, mean_edge(before))
-    model = TensorMassModel(mesh, _TISSUE)
+    model = ElasticModel(mesh, _TISSUE)
     batches = np.min([run.milliseconds for run in runs], axis=0)
     extra = bound.inertia(np.arange(mesh.node_count)).sum() / model.mass.sum() - 1
     return Row(
@@ -349,7 +350,7 @@ def _row(stroke: Stroke, method: str, runs: list[Cut]) -> Row:
     )
 
 
-def highest_frequency(model: TensorMassModel) -> float:
+def highest_frequency(model: ElasticModel) -> float:
     """Highest natural frequency with the masses that the tissue has, converged [rad/s]."""
     root = np.sqrt(_inverse(model))
 
@@ -406,28 +407,16 @@ def _continued(path: Floats, by: float) -> Floats:
 
 def rk4_milliseconds() -> float:
     """What one RK4 step of about 10,000 tetrahedra takes here and now [ms]."""
-    model = TensorMassModel(TetMesh(*good_block((17, 7, 7), _CELL, seed=-1)), _TISSUE)
+    model = ElasticModel(TetMesh(*good_block((17, 7, 7), _CELL, seed=-1)), _TISSUE)
     size = 3 * model.mesh.node_count
     state = np.random.default_rng(0).standard_normal((2, size)) * 1e-9
-    none, nowhere = np.zeros(0), np.zeros(3)
+    integrator, inverse = Integrator('rk4', 0.0, 0.0), _inverse(model)
+    no_tool = Coupling().spring(model.mesh.rest)
     spent = []
     for _ in range(30):
         start = time.thread_time()
-        rk4_steps(
-            model.operands,
-            _inverse(model),
-            np.zeros(2),
-            nowhere,
-            *state,
-            np.zeros((6, size)),
-            1e-5,
-            1,
-            0,
-            np.zeros(0, np.int64),
-            none,
-            np.zeros((2, 3)),
-            nowhere,
-            np.zeros(2),
+        integrator.step(
+            model.operands(), inverse, model.diagonal, no_tool, state[0], state[1], 1e-5, 1
         )
         spent.append(1e3 * (time.thread_time() - start))
     return median(spent)

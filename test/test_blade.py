@@ -9,9 +9,11 @@ import pytest
 from meshes import box
 
 from tissue_sim.blade import Resistance
+from tissue_sim.contact import Command, Frame, State, ToolContact
+from tissue_sim.dynamics import TimeStepping
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
-from tissue_sim.simulation import Command, Frame, State, TissueSimulation, ToolContact
+from tissue_sim.simulation import TissueSimulation
 
 TOUGHNESS, RATE = 40.0, 500.0
 
@@ -22,7 +24,7 @@ def block(stretch: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TissueSimula
         TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
         Material(5000.0, 0.4, 1000.0, 5.0, 1e-3),
         Resistance(0.05, TOUGHNESS, 0.0),
-        rate=RATE,
+        stepping=TimeStepping(rate=RATE),
         stretch=stretch,
     )
 

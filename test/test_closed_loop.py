@@ -8,10 +8,11 @@ import pytest
 from haptic_bridge.proxy import Proxy
 from haptic_bridge.surface import Surface
 from tissue_sim.blade import Resistance
+from tissue_sim.contact import Frame, State, ToolContact
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.mesh_io import load_mesh
-from tissue_sim.simulation import Frame, State, TissueSimulation, ToolContact
+from tissue_sim.simulation import TissueSimulation
 
 LIVER = Path(__file__).parents[1] / 'config' / 'meshes' / 'liver.msh'
 RADIUS, STIFFNESS, TICKS = 0.004, 200.0, 33

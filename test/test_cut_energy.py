@@ -8,9 +8,11 @@ from test_blade import contact_at, path
 from cutting.methods import make_method
 from cutting.settings import CuttingSettings
 from tissue_sim.blade import Resistance
+from tissue_sim.contact import Command, Frame
+from tissue_sim.dynamics import TimeStepping
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
-from tissue_sim.simulation import Command, Frame, TissueSimulation
+from tissue_sim.simulation import TissueSimulation
 from tissue_sim.topology import CUT
 
 TOUGHNESS, RATE = 40.0, 500.0
@@ -77,8 +79,7 @@ def test_the_work_of_the_blade_is_accounted_for_within_five_per_cent(stops) -> N
             TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
             MATERIAL,
             Resistance(0.05, TOUGHNESS, 0.0),
-            rate=RATE,
-            max_substeps=1000,
+            stepping=TimeStepping(rate=RATE, max_substeps=1000),
         )
     )
     for tip in path(*stops, speed=0.08):

@@ -13,9 +13,9 @@ from cutting.methods import make_method
 from cutting.settings import CuttingSettings
 from tissue_sim.blade import Sweep
 from tissue_sim.compliance import solve_static
+from tissue_sim.elasticity import ElasticModel
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
-from tissue_sim.tensor_mass import TensorMassModel
 from tissue_sim.topology import CUT
 
 MATERIAL = Material(10000.0, 0.3, 1000.0)
@@ -24,9 +24,9 @@ LENGTH, WIDTH, HEIGHT = (cells * SIZE for cells in CELLS)
 MIDDLE, DEPTH = LENGTH / 2, HEIGHT / 2
 
 
-def cut_model(mesh: TetMesh, path: np.ndarray) -> tuple[TensorMassModel, np.ndarray]:
+def cut_model(mesh: TetMesh, path: np.ndarray) -> tuple[ElasticModel, np.ndarray]:
     """Cuts along a path, the model following batch by batch; also how often each case was met."""
-    model = TensorMassModel(mesh, MATERIAL)
+    model = ElasticModel(mesh, MATERIAL)
     method = make_method(CuttingSettings())
     cases = np.zeros(len(CASES), np.int64)
     for sweep in [*(Sweep(*a, *b) for a, b in pairwise(path)), None]:
@@ -35,12 +35,12 @@ def cut_model(mesh: TetMesh, path: np.ndarray) -> tuple[TensorMassModel, np.ndar
         else:
             result = method.advance(mesh, mesh.rest, sweep)
         if not result.delta.empty:
-            model.update(mesh.apply(result.delta).nodes)
+            model.update(mesh.apply(result.delta))
         cases += result.report.cases
     return model, cases
 
 
-def notched(nodes: np.ndarray, tets: np.ndarray, x: float, depth: float) -> TensorMassModel:
+def notched(nodes: np.ndarray, tets: np.ndarray, x: float, depth: float) -> ElasticModel:
     """A block notched by the blade from above, across its width, in eight steps."""
     way = np.linspace(-0.3 * WIDTH, 1.3 * WIDTH, 9)
     path = np.array([[[x, y, 1.2 * HEIGHT], [x, y, HEIGHT - depth]] for y in way])
@@ -59,10 +59,10 @@ def with_slit(layers: int) -> tuple[float, float, float]:
     mesh = TetMesh(np.concatenate([nodes, nodes[on]]), np.where(right[:, None], twin[tets], tets))
     flat = (abs(mesh.rest[mesh.triangles][:, :, 0] - MIDDLE) < 1e-9).all(axis=1)
     mesh.set_kinds(mesh.triangles.copy(), np.where(flat, CUT, 0).astype(np.uint8))
-    return pulled(TensorMassModel(mesh, MATERIAL))
+    return pulled(ElasticModel(mesh, MATERIAL))
 
 
-def pulled(model: TensorMassModel) -> tuple[float, float, float]:
+def pulled(model: ElasticModel) -> tuple[float, float, float]:
     """Area of the slit [m^2], force [N] and volume of the opening [m^3] at 1 % of stretch."""
     mesh = model.mesh
     x = mesh.rest[:, 0]
@@ -101,19 +101,19 @@ def test_a_notch_cut_through_elements_opens_like_a_slit_to_two_per_cent(
     slits = np.array([with_slit(layers) for layers in range(7, 11)])
     assert force == pytest.approx(np.interp(area, slits[:, 0], slits[:, 1]), rel=0.02)
     assert opening == pytest.approx(np.interp(area, slits[:, 0], slits[:, 2]), rel=0.02)
-    whole = pulled(TensorMassModel(TetMesh(nodes, tets), MATERIAL))[1]
+    whole = pulled(ElasticModel(TetMesh(nodes, tets), MATERIAL))[1]
     assert force < 0.75 * whole
 
 
-def tied(model: TensorMassModel) -> tuple[np.ndarray, TensorMassModel]:
+def tied(model: ElasticModel) -> tuple[np.ndarray, ElasticModel]:
     """Number of each node with copies at one place made one, and the mesh that this closes."""
     mesh = model.mesh
     rest, number = np.unique(mesh.rest, axis=0, return_inverse=True)
     number = number.ravel()
-    return number, TensorMassModel(TetMesh(rest, number[mesh.tetrahedra]), MATERIAL)
+    return number, ElasticModel(TetMesh(rest, number[mesh.tetrahedra]), MATERIAL)
 
 
-def tied_stiffness(model: TensorMassModel, number: np.ndarray) -> np.ndarray:
+def tied_stiffness(model: ElasticModel, number: np.ndarray) -> np.ndarray:
     """Stiffness of the cut tissue under the constraint that copies move together [N/m]."""
     row = (3 * number[:, None] + np.arange(3)).ravel()
     out = np.zeros((row.max() + 1, row.max() + 1))
@@ -121,7 +121,7 @@ def tied_stiffness(model: TensorMassModel, number: np.ndarray) -> np.ndarray:
     return out
 
 
-def partial_cut(seed: int) -> tuple[TensorMassModel, np.ndarray]:
+def partial_cut(seed: int) -> tuple[ElasticModel, np.ndarray]:
     """A small irregular block with a cut of some kind that may end inside."""
     rng = np.random.default_rng(seed)
     nodes, tets = shuffled_box(np.array([3, 3, 2]), 0.005, 0.15, rng)

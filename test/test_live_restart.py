@@ -26,10 +26,10 @@ from bags.decode import decode
 from cutting.checks import check_mesh, lips
 from session.graph import node_environment
 from session.status import Status
+from tissue_sim.contact import State
 from tissue_sim.mesh import TetMesh
 from tissue_sim.replica import MeshReplica
 from tissue_sim.ros import FORCE, take
-from tissue_sim.simulation import State
 
 SECONDS = 48.0
 """Longer than it takes, even on a busy machine: the test interrupts the session."""

@@ -5,17 +5,17 @@ import pytest
 from meshes import box, irregular_box
 
 from tissue_sim.coupling import PUSH, Coupling
-from tissue_sim.integrators import rk4_steps
+from tissue_sim.elasticity import ElasticModel
+from tissue_sim.integrators import Integrator
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
-from tissue_sim.stability import FrequencyBound, rk4_amplification, rk4_step_bound
-from tissue_sim.tensor_mass import TensorMassModel
+from tissue_sim.stability import FrequencyBound, amplification, step_bound
 
 LIVER = Material(642.55, 0.47, 1050.0, 0.0, 0.0)
 
 
-def model_of(nodes: np.ndarray, tets: np.ndarray, material: Material = LIVER) -> TensorMassModel:
-    return TensorMassModel(TetMesh(nodes, tets), material)
+def model_of(nodes: np.ndarray, tets: np.ndarray, material: Material = LIVER) -> ElasticModel:
+    return ElasticModel(TetMesh(nodes, tets), material)
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -115,12 +115,10 @@ def free_vibration(dt_share: float, duration_steps: int) -> tuple[np.ndarray, np
     exact = root * (modes @ (amplitudes * np.cos(omega * time)))
     u, v = u0.copy(), np.zeros(size)
     before = 0.5 * u @ model.force(u.reshape(-1, 3)).ravel()
-    none = Coupling()
-    rk4_steps(
-        model.operands, inverse, np.zeros(2), np.zeros(3), u, v, np.zeros((6, size)), dt,
-        duration_steps, none.mode, none.nodes, none.weights, np.zeros((2, 3)), none.normal,
-        np.zeros(2),
-    )  # fmt: skip
+    none = Coupling().spring(nodes)
+    Integrator('rk4', 0.0, 0.0).step(
+        model.operands(), inverse, model.diagonal, none, u, v, dt, duration_steps
+    )
     after = 0.5 * u @ model.force(u.reshape(-1, 3)).ravel() + 0.5 * (v * v) @ (1 / inverse)
     return u, exact, after / before - 1
 
@@ -162,22 +160,22 @@ def test_right_after_a_change_the_bound_is_rigorous() -> None:
 @pytest.mark.parametrize('beta', [0.0, 1e-4, 1e-3, 1e-2])
 def test_the_step_bound_separates_decay_from_growth(beta: float) -> None:
     omega = 700.0
-    dt = rk4_step_bound(omega, 1.0, beta)
+    dt = step_bound('rk4', omega, 1.0, beta)
     modes = omega * np.linspace(0.01, 1, 2000)
-    assert rk4_amplification(modes, 1.0, beta, 0.999 * dt).max() <= 1
-    assert rk4_amplification(modes, 1.0, beta, 1.02 * dt).max() > 1
+    assert amplification('rk4', modes, 1.0, beta, 0.999 * dt).max() <= 1
+    assert amplification('rk4', modes, 1.0, beta, 1.02 * dt).max() > 1
 
 
 def test_without_damping_the_step_bound_is_that_of_the_imaginary_axis() -> None:
-    assert rk4_step_bound(700.0, 0.0, 0.0) == pytest.approx(2 * np.sqrt(2) / 700.0, rel=1e-5)
+    assert step_bound('rk4', 700.0, 0.0, 0.0) == pytest.approx(2 * np.sqrt(2) / 700.0, rel=1e-5)
 
 
-def pressed(seconds: float, stiffness: float) -> tuple[TensorMassModel, np.ndarray, Coupling]:
+def pressed(seconds: float, stiffness: float) -> tuple[ElasticModel, np.ndarray, Coupling]:
     """A block pressed by a spring at the middle of its top until it rests."""
     nodes, tets = box((6, 6, 3), 0.01)
     fixed = nodes[:, 2] < 1e-9
     material = Material(5000.0, 0.4, 1000.0, 20.0, 2e-3)
-    model = TensorMassModel(TetMesh(nodes, tets, fixed), material)
+    model = ElasticModel(TetMesh(nodes, tets, fixed), material)
     top = int(np.argmin(np.linalg.norm(nodes - [0.03, 0.03, 0.03], axis=1)))
     load = Coupling(
         mode=PUSH,
@@ -190,12 +188,10 @@ def pressed(seconds: float, stiffness: float) -> tuple[TensorMassModel, np.ndarr
     inverse = np.repeat(np.where(fixed, 0.0, 1 / model.mass), 3)
     u, v = np.zeros(nodes.size), np.zeros(nodes.size)
     omega = FrequencyBound(model, inverse).omega + np.sqrt(stiffness / model.mass[top])
-    dt = 0.8 * rk4_step_bound(omega, material.alpha, material.beta)
-    rk4_steps(
-        model.operands, inverse, np.array([20.0, 2e-3]), nodes[top], u, v,
-        np.zeros((6, nodes.size)), dt, int(seconds / dt), load.mode, load.nodes, load.weights,
-        np.array([load.start, load.end]), load.normal, np.array([stiffness, np.inf]),
-    )  # fmt: skip
+    dt = 0.8 * step_bound('rk4', omega, material.alpha, material.beta)
+    Integrator('rk4', 20.0, 2e-3).step(
+        model.operands(), inverse, model.diagonal, load.spring(nodes), u, v, dt, int(seconds / dt)
+    )
     return model, u.reshape(-1, 3), load
 
 

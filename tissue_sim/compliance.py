@@ -3,15 +3,14 @@
 import numpy as np
 from numba import njit
 
-from tissue_sim.tensor_mass import TensorMassModel, multiply
+from tissue_sim.elasticity import ElasticModel, stiffness_product
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
 def _conjugate_gradients(operands, preconditioner, b, x, work, steps):
     """Preconditioned conjugate gradients on K x = b from x; returns 2 b.x - x.K x <= b.K^-1 b."""
-    start, used, columns, blocks, diagonal = operands
     r, p, q = work[0], work[1], work[2]
-    multiply(start, used, columns, blocks, diagonal, x, q)
+    stiffness_product(operands, x, q)
     rho = 0.0
     for i in range(x.shape[0]):
         free = preconditioner[i] > 0.0
@@ -21,7 +20,7 @@ def _conjugate_gradients(operands, preconditioner, b, x, work, steps):
     for _ in range(steps):
         if rho <= 1e-30:
             break
-        multiply(start, used, columns, blocks, diagonal, p, q)
+        stiffness_product(operands, p, q)
         curvature = 0.0
         for i in range(x.shape[0]):
             curvature += p[i] * q[i]
@@ -44,7 +43,7 @@ def _conjugate_gradients(operands, preconditioner, b, x, work, steps):
 
 
 def solve_static(
-    model: TensorMassModel, free: np.ndarray, load: np.ndarray, tolerance: float = 1e-12
+    model: ElasticModel, free: np.ndarray, load: np.ndarray, tolerance: float = 1e-12
 ) -> np.ndarray:
     """Displacement under constant forces, the fixed nodes at rest.
 
@@ -62,16 +61,15 @@ def solve_static(
     preconditioner = _diagonal_preconditioner(model, free)
     work = np.empty((3, len(b)))
     for _ in range(100):
-        _conjugate_gradients(model.operands, preconditioner, b, x, work, 200)
-        residual = np.where(free, b - model.force(x.reshape(-1, 3)).ravel(), 0.0)
+        _conjugate_gradients(model.operands(), preconditioner, b, x, work, 200)
+        residual = np.where(free, b - model.product(x.reshape(-1, 3)).ravel(), 0.0)
         if np.linalg.norm(residual) <= tolerance * np.linalg.norm(b):
             break
     return x.reshape(-1, 3)
 
 
-def _diagonal_preconditioner(model: TensorMassModel, free: np.ndarray) -> np.ndarray:
-    diagonal = model.operands[4].reshape(-1, 6)[:, [0, 3, 5]].ravel()
-    return np.where(free, 1.0 / np.maximum(diagonal, 1e-30), 0.0)
+def _diagonal_preconditioner(model: ElasticModel, free: np.ndarray) -> np.ndarray:
+    return np.where(free, 1.0 / np.maximum(model.diagonal, 1e-30), 0.0)
 
 
 class PointCompliance:
@@ -90,7 +88,7 @@ class PointCompliance:
         self._topology = -1
 
     def estimate(
-        self, model: TensorMassModel, free: np.ndarray, nodes: np.ndarray, load: np.ndarray
+        self, model: ElasticModel, free: np.ndarray, nodes: np.ndarray, load: np.ndarray
     ) -> float:
         """Refines and returns the compliance.
 
@@ -112,5 +110,7 @@ class PointCompliance:
         b[~free] = 0.0
         preconditioner = _diagonal_preconditioner(model, free)
         work = np.empty((3, size))
-        value = _conjugate_gradients(model.operands, preconditioner, b, self._x, work, self._steps)
+        value = _conjugate_gradients(
+            model.operands(), preconditioner, b, self._x, work, self._steps
+        )
         return max(float(value), 0.0)

@@ -6,6 +6,7 @@ tissue end moves with the nodes.
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -15,6 +16,25 @@ PUSH = 1
 HOLD = 2
 _GRIP = 1.0
 """Largest force along the surface in a frame, as a part of that into it."""
+
+
+class Spring(NamedTuple):
+    """What the kernels take of a coupling.
+
+    Attributes:
+        mode, nodes, weights, normal: see `Coupling`.
+        ends: its tool's end at the start and at the end of the frame [m], shape (2, 3).
+        anchor: rest position of the tissue's end [m], shape (3,).
+        scalars: stiffness [N/m] and largest force [N].
+    """
+
+    mode: int
+    nodes: np.ndarray
+    weights: np.ndarray
+    normal: np.ndarray
+    ends: np.ndarray
+    anchor: np.ndarray
+    scalars: np.ndarray
 
 
 @dataclass
@@ -45,6 +65,18 @@ class Coupling:
     def point(self, positions: np.ndarray) -> np.ndarray:
         """The tissue's end of the spring [m], shape (3,), for node positions [m], shape (n, 3)."""
         return self.weights @ positions[self.nodes]
+
+    def spring(self, rest: np.ndarray) -> Spring:
+        """What the kernels take, for rest positions [m], shape (n, 3)."""
+        return Spring(
+            self.mode,
+            self.nodes,
+            self.weights,
+            self.normal,
+            np.array([self.start, self.end]),
+            self.weights @ rest[self.nodes],
+            np.array([self.stiffness, self.limit]),
+        )
 
     def force(self, positions: np.ndarray) -> np.ndarray:
         """Force on the tissue at the end of the frame [N], shape (3,)."""
@@ -86,3 +118,55 @@ def spring_force(mode, stretch, normal, scalars, out):
             size = limit / length
         for i in range(3):
             out[i] = size * stretch[i]
+
+
+@njit(cache=True)
+def spring_stretch(spring, at, u, stretch):
+    """Tool's end minus tissue's end.
+
+    Args:
+        spring: see `Spring`.
+        at: share of the frame that has passed.
+        u: displacement by coordinate [m], shape (3 n,).
+        stretch: output [m], shape (3,).
+    """
+    ends = spring.ends
+    for i in range(3):
+        stretch[i] = ends[0, i] + at * (ends[1, i] - ends[0, i]) - spring.anchor[i]
+        for c in range(spring.nodes.shape[0]):
+            stretch[i] -= spring.weights[c] * u[3 * spring.nodes[c] + i]
+
+
+@njit(cache=True)
+def subtract_spring(spring, at, u, f, out):
+    """Takes the spring's force on the tissue off the elastic one.
+
+    Args:
+        spring: see `Spring`.
+        at: share of the frame that has passed.
+        u: displacement by coordinate [m], shape (3 n,).
+        f: what is to be subtracted from [N], shape (3 n,).
+        out: the spring's force [N], shape (3,).
+    """
+    stretch = np.empty(3)
+    spring_stretch(spring, at, u, stretch)
+    spring_force(spring.mode, stretch, spring.normal, spring.scalars, out)
+    for c in range(spring.nodes.shape[0]):
+        for i in range(3):
+            f[3 * spring.nodes[c] + i] -= spring.weights[c] * out[i]
+
+
+@njit(cache=True)
+def spring_work(spring, force, u):
+    """Force times where the tissue's end has moved from rest [J]; differences are work.
+
+    Args:
+        spring: see `Spring`.
+        force: on the tissue [N], shape (3,).
+        u: displacement by coordinate [m], shape (3 n,).
+    """
+    work = 0.0
+    for c in range(spring.nodes.shape[0]):
+        for i in range(3):
+            work += force[i] * spring.weights[c] * u[3 * spring.nodes[c] + i]
+    return work

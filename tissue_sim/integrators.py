@@ -1,85 +1,80 @@
-"""Fourth-order Runge-Kutta for M u'' + (alpha M + beta K) u' + K u = f.
+"""The integrators, one protocol: some steps of M u'' + (alpha M + beta K) u' + K u = f in place."""
 
-Thesis 4.4.3, with the velocity updated by its own stages.
-"""
+from typing import Literal, get_args
 
 import numpy as np
-from numba import njit
 
-from tissue_sim.coupling import spring_force
-from tissue_sim.tensor_mass import multiply
+from tissue_sim.coupling import Spring
+from tissue_sim.elasticity import Operands
+from tissue_sim.explicit import euler_steps, rk4_steps, symplectic_euler_steps
+from tissue_sim.implicit import implicit_steps
+
+IntegratorName = Literal['euler', 'symplectic_euler', 'rk4', 'implicit']
+INTEGRATORS: tuple[IntegratorName, ...] = get_args(IntegratorName)
+
+_EXPLICIT = {
+    'euler': euler_steps,
+    'symplectic_euler': symplectic_euler_steps,
+    'rk4': rk4_steps,
+}
 
 
-@njit(cache=True, error_model='numpy')
-def rk4_steps(
-    operands,
-    inverse_mass,
-    damping,
-    anchor,
-    u,
-    v,
-    work,
-    dt,
-    steps,
-    mode,
-    nodes,
-    weights,
-    ends,
-    normal,
-    scalars,
-):
-    """Advances displacement and velocity in place.
-
-    Damping costs no force evaluation of its own: K is applied to u + beta v.
+class Integrator:
+    """Steps of one method.
 
     Args:
-        operands: start, used, columns, blocks, diagonal as `TensorMassModel.operands`.
-        inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
-        damping: alpha [1/s] and beta [s].
-        anchor: rest position of the coupling's material point [m], shape (3,).
-        u, v: displacement [m] and velocity [m/s], shape (3 n,).
-        work: scratch, shape (6, >= 3 n).
-        dt: step [s].
-        steps: how many.
-        mode, nodes, weights, normal, scalars: the coupling spring, see `Coupling` and
-            `spring_force`.
-        ends: its tool's end at the start and at the end of all steps [m], shape (2, 3).
+        name: which method.
+        alpha, beta: Rayleigh damping [1/s], [s].
+        tolerance: of the implicit method's residual, relative to the loads.
     """
-    start, used, columns, blocks, diagonal = operands
-    alpha, beta = damping[0], damping[1]
-    size = u.shape[0]
-    us, vs, q = work[0, :size], work[1, :size], work[2, :size]
-    f, du, dv = work[3, :size], work[4, :size], work[5, :size]
-    point = np.empty(3)
-    spring = np.empty(3)
-    for step in range(steps):
-        us[:] = u
-        vs[:] = v
-        du[:] = 0.0
-        dv[:] = 0.0
-        for stage in range(4):
-            for i in range(size):
-                q[i] = us[i] + beta * vs[i]
-            multiply(start, used, columns, blocks, diagonal, q, f)
-            if mode != 0:
-                at = (step + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / steps
-                for i in range(3):
-                    point[i] = ends[0, i] + at * (ends[1, i] - ends[0, i]) - anchor[i]
-                    for c in range(nodes.shape[0]):
-                        point[i] -= weights[c] * us[3 * nodes[c] + i]
-                spring_force(mode, point, normal, scalars, spring)
-                for c in range(nodes.shape[0]):
-                    for i in range(3):
-                        f[3 * nodes[c] + i] -= weights[c] * spring[i]
-            share = dt / 6.0 if stage == 0 or stage == 3 else dt / 3.0
-            ahead = dt if stage == 2 else 0.5 * dt
-            for i in range(size):
-                a = -f[i] * inverse_mass[i] - alpha * vs[i]
-                w = vs[i]
-                du[i] += share * w
-                dv[i] += share * a
-                us[i] = u[i] + ahead * w
-                vs[i] = v[i] + ahead * a
-        for i in range(size):
-            u[i] += du[i]
-            v[i] += dv[i]
+
+    def __init__(
+        self, name: IntegratorName, alpha: float, beta: float, *, tolerance: float = 1e-4
+    ) -> None:
+        self.name = name
+        self._damping = np.array([alpha, beta])
+        self._tolerance = tolerance
+        self._work = np.zeros((7, 0))
+
+    def step(
+        self,
+        operands: Operands,
+        inverse_mass: np.ndarray,
+        diagonal: np.ndarray,
+        spring: Spring,
+        u: np.ndarray,
+        v: np.ndarray,
+        dt: float,
+        steps: int,
+        *,
+        spans: np.ndarray | None = None,
+        first: int = 0,
+        total: int | None = None,
+    ) -> float:
+        """Advances displacement and velocity in place.
+
+        Args:
+            operands: of the model.
+            inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
+            diagonal: `ElasticModel.diagonal` [N/m], shape (3 n,).
+            spring: the tool's coupling.
+            u, v: displacement [m] and velocity [m/s], shape (3 n,).
+            dt: step [s].
+            steps: how many.
+            spans: intervals of nodes that move, None: all, shape (s, 2).
+            first: number of the first of the steps in its frame.
+            total: steps of the frame, None: `steps`; the tool moves through all of them.
+
+        Returns:
+            Work of the spring on the tissue [J].
+        """
+        if self._work.shape[1] < len(u):
+            self._work = np.zeros((7, len(u)))
+        if spans is None:
+            spans = np.array([[0, len(u) // 3]])
+        count = steps if total is None else total
+        head = (operands, spans, inverse_mass, self._damping, spring)
+        tail = (u, v, self._work, dt, first, steps, count)
+        if self.name == 'implicit':
+            return float(implicit_steps(*head, diagonal, self._tolerance, *tail))
+        return float(_EXPLICIT[self.name](*head, *tail))

@@ -8,10 +8,10 @@ from builtin_interfaces.msg import Time
 from cutting_trainer_msgs.msg import Contact, ForceSample, Mesh, MeshDelta
 from cutting_trainer_msgs.srv import Cut
 
+from tissue_sim.contact import Frame, State, ToolContact
 from tissue_sim.mesh import TetMesh, TopologyDelta, Touched
 from tissue_sim.replica import state_hash
 from tissue_sim.ros import FRAME
-from tissue_sim.simulation import Frame, State, ToolContact
 
 _CODES = {'d': np.float64, 'I': np.uint32, 'B': np.uint8}
 

@@ -12,14 +12,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from tissue_sim import messages, ros
+from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
+from tissue_sim.contact import Command, Frame, ToolContact
+from tissue_sim.dynamics import TimeStepping
 from tissue_sim.errors import MeshError
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, Touched
 from tissue_sim.mesh_io import load_tissue
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
-from tissue_sim.simulation import Command, Frame, TissueSimulation, ToolContact
+from tissue_sim.simulation import TissueSimulation
 from tissue_sim.timing import PeriodicLoop
 from tissue_sim.warm_up import warm_up
 
@@ -43,11 +46,17 @@ def make_simulation(settings: TissueSettings) -> TissueSimulation:
         TetMesh(nodes, tetrahedra, fixed),
         Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
         Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
-        rate=settings.integration.rate,
-        safety=settings.integration.safety,
-        max_substeps=settings.integration.max_substeps,
+        model=settings.model,
+        stepping=TimeStepping(
+            settings.integrator,
+            rate=settings.integration.rate,
+            safety=settings.integration.safety,
+            min_substeps=settings.integration.min_substeps,
+            max_substeps=settings.integration.max_substeps,
+            frequency_growth=settings.integration.frequency_growth,
+        ),
+        active=ActiveSettings(**settings.active_region.model_dump()),
         stretch=settings.stretch,
-        frequency_growth=settings.integration.frequency_growth,
     )
 
 
@@ -118,6 +127,8 @@ class TissueSimNode(Node):
             )
         else:
             self._rejected['diverged frame'] += 1
+        if frame.trouble:
+            self.get_logger().error(frame.trouble, throttle_duration_sec=1.0)
         if delta is not None:
             self._updates.publish(delta)
         if time.monotonic() >= self._next_keyframe:
@@ -215,14 +226,19 @@ class TissueSimNode(Node):
             'nodes': simulation.mesh.node_count,
             'elements_cut': simulation.elements_cut,
             'topology': simulation.mesh.topology,
-            'omega_bound': simulation.omega,
+            'omega_bound': simulation.dynamics.omega,
+            'step_bound': simulation.dynamics.bound(),
+            'active_nodes': simulation.dynamics.active_nodes,
+            'inverted': simulation.dynamics.inverted,
         }
         values |= {f'refused {what}': count for what, count in self._rejected.items()}
         if frame is None:
             return DiagnosticStatus.OK, 'starting', values
         values |= {'substeps': frame.substeps, 'slow_motion': frame.slow_motion}
         if frame.diverged:
-            return DiagnosticStatus.ERROR, 'a frame diverged and was taken back', values
+            return DiagnosticStatus.ERROR, f'a frame was taken back: {frame.trouble}', values
+        if frame.trouble:
+            return DiagnosticStatus.WARN, frame.trouble, values
         if frame.slow_motion < 0.999:
             return DiagnosticStatus.WARN, 'max_substeps is too small for real time', values
         return DiagnosticStatus.OK, frame.state.name.lower(), values

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from tissue_sim.elasticity import ModelName
+from tissue_sim.integrators import IntegratorName
 from tissue_sim.scene_file import SceneModel, ScenePath
 
 UNIT_SCALE = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
@@ -140,9 +142,6 @@ class FixedRegion(SceneModel):
 class Integration(SceneModel):
     """How a frame is integrated in time."""
 
-    method: Literal['rk4'] = Field(
-        default='rk4', description='rk4: the classical fourth-order Runge-Kutta method'
-    )
     rate: float = Field(default=30.0, ge=1, le=240, description='frames a second [Hz], 1 to 240')
     safety: float = Field(
         default=0.8,
@@ -157,8 +156,33 @@ class Integration(SceneModel):
         description='how far cuts may raise the highest frequency before small nodes are '
         'integrated with more mass [-], 1 to 1000',
     )
+    min_substeps: int = Field(
+        default=1,
+        ge=1,
+        le=1000,
+        description='substeps of a frame at least [-], 1 to 1000; the accuracy of implicit',
+    )
     max_substeps: int = Field(
         default=200, ge=1, le=10000, description='substeps of a frame at most [-], 1 to 10000'
+    )
+
+
+class ActiveRegion(SceneModel):
+    """Nodes that nothing moves are not integrated."""
+
+    mode: Literal['off', 'on', 'budget'] = Field(
+        default='off',
+        description='off: all nodes move; on: those that forces or neighbours move; budget: of '
+        'those the nodes nearest to the tool',
+    )
+    nodes: int = Field(
+        default=2000, ge=1, le=10**7, description='how many move at most with budget [-], 1 to 1e7'
+    )
+    tolerance: float = Field(
+        default=1e-3,
+        gt=0,
+        le=1,
+        description='speed below which a node may sleep, of the fastest of late [-], above 0 to 1',
     )
 
 
@@ -187,9 +211,31 @@ class TissueSettings(SceneModel):
         le=100,
         description='contact force that lets the blade in [N], above 0 to 100',
     )
-    integration: Integration = Field(
-        default=Integration(), description='method, rate, safety and max_substeps'
+    model: ModelName = Field(
+        default='linear',
+        description='linear: tensor-mass; linear_smoothed: strains averaged over nodes, against '
+        'locking; corotational: elements turn with the tissue; corotational_smoothed: both',
     )
+    integrator: IntegratorName = Field(
+        default='rk4',
+        description='euler: forward, needs damping; symplectic_euler: one force a step; rk4: '
+        'fourth-order Runge-Kutta; implicit: backward Euler, any step, damps',
+    )
+    active_region: ActiveRegion = Field(
+        default=ActiveRegion(), description='which nodes are integrated: mode, nodes, tolerance'
+    )
+    integration: Integration = Field(
+        default=Integration(), description='rate, safety, substeps and frequency_growth'
+    )
+
+    @model_validator(mode='after')
+    def _check_damping(self) -> Self:
+        if self.integrator == 'euler' and self.damping.alpha == self.damping.beta == 0.0:
+            raise ValueError(
+                'integrator euler has no stable step without damping: set damping.beta above 0, '
+                'or take symplectic_euler'
+            )
+        return self
 
     @property
     def unit_scale(self) -> float:

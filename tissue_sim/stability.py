@@ -1,66 +1,21 @@
-"""How large a step may be: a bound of the highest frequency, and the region of stability of RK4."""
+"""How large a step may be: a bound of the highest frequency, the stable regions of integrators."""
+
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 
+from tissue_sim.elasticity import ElasticModel, stiffness_product
+from tissue_sim.integrators import IntegratorName
 from tissue_sim.mesh import grown
-from tissue_sim.tensor_mass import TensorMassModel, multiply
-
-
-@njit(cache=True)
-def gershgorin_rows(tensors, links, nodes, out):
-    """Row sums of M^-1 K by 3x3 blocks: no eigenvalue of M^-1 K exceeds the largest of all rows.
-
-    A row depends on the mass and the tensors of its own node, so only rows that a cut touched
-    change.
-
-    Args:
-        tensors: a `tensor_mass.Tensors`.
-        links: connectivity.
-        nodes: which rows, shape (r,).
-        out: squares of frequencies [1/s^2], written at `nodes`, shape (>= n,).
-    """
-    seen = np.empty(256, np.int64)
-    for which in range(len(nodes)):
-        node = nodes[which]
-        d = tensors.diagonal[node]
-        total = np.sqrt(d[0] ** 2 + d[3] ** 2 + d[5] ** 2 + 2 * (d[1] ** 2 + d[2] ** 2 + d[4] ** 2))
-        number = 0
-        corner = links.first_corner[node]
-        while corner >= 0:
-            for b in range(4):
-                other = links.tetrahedra[corner // 4, b]
-                new = other != node
-                for k in range(number):
-                    if seen[k] == other:
-                        new = False
-                if new:
-                    total += _edge_norm(tensors, min(node, other), max(node, other))
-                    if number < 256:
-                        seen[number] = other
-                        number += 1
-            corner = links.corner_next[corner]
-        out[node] = total / tensors.mass[node]
-
-
-@njit(cache=True)
-def _edge_norm(tensors, low, high):
-    for slot in range(tensors.start[low], tensors.start[low] + tensors.used[low]):
-        if tensors.columns[slot] == 3 * high:
-            square = 0.0
-            for i in range(9):
-                square += tensors.blocks[9 * slot + i] ** 2
-            return np.sqrt(square)
-    return 0.0
 
 
 @njit(cache=True, error_model='numpy')
 def _power_iterations(operands, inverse_mass, x, f, steps):
     """Power iterations of M^-1 K on x in place; returns the last Rayleigh quotient (mass norm)."""
-    start, used, columns, blocks, diagonal = operands
     quotient = 0.0
     for _ in range(steps):
-        multiply(start, used, columns, blocks, diagonal, x, f)
+        stiffness_product(operands, x, f)
         above = 0.0
         below = 0.0
         norm = 0.0
@@ -90,7 +45,7 @@ class FrequencyBound:
     (selective mass scaling): a few milligrams where nothing but a shorter step would be gained.
 
     Args:
-        model: a tensor-mass model.
+        model: the elastic model.
         inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
         growth: the ceiling, as a multiple of the bound at the start.
     """
@@ -99,7 +54,7 @@ class FrequencyBound:
     _ENOUGH = 48
 
     def __init__(
-        self, model: TensorMassModel, inverse_mass: np.ndarray, growth: float = np.inf
+        self, model: ElasticModel, inverse_mass: np.ndarray, growth: float = np.inf
     ) -> None:
         self._model = model
         self._ceiling = np.inf
@@ -121,7 +76,7 @@ class FrequencyBound:
         mesh = self._model.mesh
         self._rows = grown(self._rows, mesh.node_count)
         touched = np.asarray(nodes, np.int64)
-        gershgorin_rows(self._model.tensors, mesh.links, touched, self._rows)
+        self._rows[touched] = self._model.frequency_rows(touched)
         self._inverse_mass = inverse_mass
         worst = np.sqrt(self._rows[touched].max(initial=0.0))
         self._provisional = max(self._provisional, min(float(worst), self._ceiling))
@@ -145,7 +100,7 @@ class FrequencyBound:
             return
         x = self._x[: 3 * self._model.mesh.node_count]
         square = _power_iterations(
-            self._model.operands, self._inverse_mass, x, np.empty_like(x), steps
+            self._model.operands(), self._inverse_mass, x, np.empty_like(x), steps
         )
         self._done += steps
         if self._done >= self._ENOUGH:
@@ -158,43 +113,63 @@ class FrequencyBound:
         return max(self._settled, self._provisional)
 
 
-def rk4_amplification(omega: np.ndarray, alpha: float, beta: float, dt: float) -> np.ndarray:
-    """Largest growth factor of a mode in one RK4 step.
+def amplification(
+    integrator: IntegratorName, omega: np.ndarray, alpha: float, beta: float, dt: float
+) -> np.ndarray:
+    """Largest growth factor of a mode in one step.
 
     Args:
+        integrator: which one.
         omega: frequencies [rad/s], any shape.
         alpha: mass-proportional damping [1/s].
         beta: stiffness-proportional damping [s].
         dt: step [s].
 
     Returns:
-        |R(lambda dt)| of the worse root of lambda^2 + (alpha + beta omega^2) lambda + omega^2 = 0.
+        Of u'' + c u' + omega^2 u = 0 with c = alpha + beta omega^2: the spectral radius of the
+        step, which is |R(lambda dt)| of the worse root of lambda^2 + c lambda + omega^2 = 0 for
+        methods that step u and v alike.
     """
     c = alpha + beta * np.square(omega)
+    if integrator == 'symplectic_euler':
+        determinant = 1 - c * dt
+        half = 1 - (c * dt + np.square(omega * dt)) / 2
+        discriminant = np.square(half) - determinant
+        real = np.abs(half) + np.sqrt(np.maximum(discriminant, 0))
+        return np.where(discriminant < 0, np.sqrt(np.maximum(determinant, 0)), real)
+    factor = _FACTORS[integrator]
     root = np.sqrt((c * c - 4 * np.square(omega)).astype(complex))
-    growth = [
-        np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)
-        for z in ((-c + root) / 2 * dt, (-c - root) / 2 * dt)
-    ]
+    growth = [np.abs(factor(z)) for z in ((-c + root) / 2 * dt, (-c - root) / 2 * dt)]
     return np.maximum(*growth)
 
 
-def rk4_step_bound(omega: float, alpha: float, beta: float) -> float:
-    """Largest step at which RK4 lets no mode up to omega grow [s].
+_FACTORS: dict[IntegratorName, Callable[[np.ndarray], np.ndarray]] = {
+    'euler': lambda z: 1 + z,
+    'rk4': lambda z: 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24,
+    'implicit': lambda z: 1 / (1 - z),
+}
 
-    Without damping this is 2.828 / omega; heavy stiffness-proportional damping brings it down to
-    2.785 / (beta omega^2).
+
+def step_bound(integrator: IntegratorName, omega: float, alpha: float, beta: float) -> float:
+    """Largest step at which no mode up to omega grows [s]; infinite for the implicit integrator.
+
+    Without damping it is 2.828 / omega for RK4, 2 / omega for symplectic Euler, 0 for forward
+    Euler. Damping allows forward Euler min(beta + alpha / omega^2, 2 / |lambda|); heavy
+    stiffness-proportional damping brings RK4 down to 2.785 / (beta omega^2).
 
     Args:
+        integrator: which one.
         omega: highest frequency [rad/s].
         alpha, beta: Rayleigh damping [1/s], [s].
     """
+    if integrator == 'implicit':
+        return float('inf')
     modes = omega * np.geomspace(1e-3, 1.0, 200)
     stable, unstable = 0.0, 4.0 / omega
     for _ in range(40):
         dt = (stable + unstable) / 2
-        if rk4_amplification(modes, alpha, beta, dt).max() <= 1 + 1e-12:
+        if amplification(integrator, modes, alpha, beta, dt).max() <= 1 + 1e-12:
             stable = dt
         else:
             unstable = dt
-    return stable
+    return stable if stable > 1e-6 / omega else 0.0

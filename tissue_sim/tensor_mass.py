@@ -1,4 +1,4 @@
-"""The linear tensor-mass model: node and edge tensors gathered from the stars of the nodes.
+"""The tensor-mass method: node and edge tensors gathered from the stars of the nodes.
 
 Cotin 2000; thesis 4.3. The stiffness is kept as the symmetric 3x3 tensor of each node and the
 tensor of each edge (i, j), i < j, in the row of i; the transpose serves row j. Rows have slack, so
@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, grown
 
 _SLACK = 4
@@ -21,19 +20,27 @@ class Tensors(NamedTuple):
 
     Attributes:
         diagonal: node tensors [N/m], xx xy xz yy yz zz, shape (n, 6).
-        mass: lumped masses [kg] (thesis eq. 4.2), shape (n,).
         start, used, room: first slot, used slots and slots of each row, shape (n,).
         columns: three times the node j of each edge tensor, shape (c,).
         blocks: edge tensors K_ij [N/m], row-major, shape (9 c,).
     """
 
     diagonal: np.ndarray
-    mass: np.ndarray
     start: np.ndarray
     used: np.ndarray
     room: np.ndarray
     columns: np.ndarray
     blocks: np.ndarray
+
+
+class Rows(NamedTuple):
+    """What `add_rows` takes of `Tensors`, for the nodes there are, `diagonal` flat."""
+
+    start: np.ndarray
+    used: np.ndarray
+    columns: np.ndarray
+    blocks: np.ndarray
+    diagonal: np.ndarray
 
 
 @njit(cache=True)
@@ -85,8 +92,8 @@ def _edge_slot(tensors, node, column):
 
 
 @njit(cache=True)
-def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu, density):
-    """Computes the rows and masses of some nodes from their stars.
+def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu):
+    """Computes the rows of some nodes from their stars.
 
     Thesis eq. 4.7, transposed as it must be:
     K_jk = V (lambda g_j g_k^T + mu g_k g_j^T + mu (g_j . g_k) I) is the force on j by the
@@ -98,7 +105,6 @@ def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu, density):
         rest: rest positions [m], shape (n, 3).
         nodes: which rows, shape (r,).
         lame_lambda, lame_mu: [Pa].
-        density: [kg/m^3].
 
     Returns:
         Index into `nodes` of the first whose row has no room, or -1.
@@ -107,14 +113,12 @@ def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu, density):
     for which in range(len(nodes)):
         node = nodes[which]
         tensors.used[node] = 0
-        tensors.mass[node] = 0.0
         for i in range(6):
             tensors.diagonal[node, i] = 0.0
         corner = links.first_corner[node]
         while corner >= 0:
             tet, a = corner // 4, corner % 4
             volume = shape_gradients(rest, links.tetrahedra, tet, g)
-            tensors.mass[node] += 0.25 * density * volume
             dot = volume * lame_mu * (g[a, 0] * g[a, 0] + g[a, 1] * g[a, 1] + g[a, 2] * g[a, 2])
             both = volume * (lame_lambda + lame_mu)
             tensors.diagonal[node, 0] += both * g[a, 0] * g[a, 0] + dot
@@ -145,20 +149,26 @@ _U4, _U5, _U7, _U8 = (np.uint64(i) for i in (4, 5, 7, 8))
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
-def multiply(start, used, columns, blocks, diagonal, u, f):
-    """Product f = K u with the symmetric halves of K.
+def add_rows(rows, awake, u, f):
+    """Adds the product K u with the symmetric halves of K.
 
     Unsigned indices: a sign test for each access costs a third.
 
     Args:
-        start, used, columns, blocks: rows as in `Tensors`.
-        diagonal: node tensors, flat, shape (6 n,).
+        rows: see `Rows`.
+        awake: intervals of nodes whose rows count, shape (s, 2).
         u: displacement by coordinate [m], shape (3 n,).
-        f: output [N], shape (3 n,).
+        f: added to [N], shape (3 n,).
     """
-    for i in range(f.shape[0]):
-        f[i] = 0.0
-    for i in range(used.shape[0]):
+    start, used, columns = rows.start, rows.used, rows.columns
+    blocks, diagonal = rows.blocks, rows.diagonal
+    for s in range(awake.shape[0]):
+        _add_interval(start, used, columns, blocks, diagonal, awake[s, 0], awake[s, 1], u, f)
+
+
+@njit(cache=True, fastmath=True, error_model='numpy')
+def _add_interval(start, used, columns, blocks, diagonal, low, high, u, f):
+    for i in range(low, min(high, used.shape[0])):
         row = _U3 * np.uint64(i)
         x0, y0, w0 = u[row], u[row + _U1], u[row + _U2]
         q = _U6 * np.uint64(i)
@@ -184,27 +194,24 @@ def multiply(start, used, columns, blocks, diagonal, u, f):
         f[row + _U2] += a2
 
 
-class TensorMassModel:
-    """Linear elasticity on a mesh that is cut (thesis 4.3, as corrected in docs/method.md).
-
-    Limitations: forces are right for small rotations only (an element that turns by theta feels a
-    strain cos(theta) - 1), and linear tetrahedra lock as nu approaches 0.5.
+class TensorMass:
+    """The tensors of a mesh that is cut.
 
     Args:
-        mesh: the mesh; the model follows it by `update`.
-        material: its constants.
+        mesh: the mesh; followed by `update`.
+        lame_lambda, lame_mu: [Pa].
     """
 
-    def __init__(self, mesh: TetMesh, material: Material) -> None:
-        self.mesh = mesh
-        self.material = material
+    def __init__(self, mesh: TetMesh, lame_lambda: float, lame_mu: float) -> None:
+        self._mesh = mesh
+        self._lame = (lame_lambda, lame_mu)
         self.rebuild()
 
     def rebuild(self) -> None:
         """Computes every row anew, packed in the order of the nodes."""
-        n = self.mesh.node_count
+        n = self._mesh.node_count
         room = np.zeros(n, np.int64)
-        tets = np.sort(self.mesh.tetrahedra, axis=1).astype(np.int64)
+        tets = np.sort(self._mesh.tetrahedra, axis=1).astype(np.int64)
         pairs = np.concatenate([tets[:, [i, j]] for i in range(4) for j in range(i + 1, 4)])
         edges = np.unique(pairs[:, 0] * n + pairs[:, 1])
         np.add.at(room, edges // n, 1)
@@ -215,7 +222,6 @@ class TensorMassModel:
         more, most = n + n // 4, 2 * slots
         self.tensors = Tensors(
             np.zeros((more, 6)),
-            np.zeros(more),
             grown(start, more),
             np.zeros(more, np.int64),
             grown(room, more),
@@ -231,12 +237,11 @@ class TensorMassModel:
         Args:
             nodes: `Touched.nodes` of the batch, shape (r,).
         """
-        n = self.mesh.node_count
+        n = self._mesh.node_count
         t = self.tensors
         known = len(t.room)
         self.tensors = t._replace(
             diagonal=grown(t.diagonal, n),
-            mass=grown(t.mass, n),
             start=grown(t.start, n),
             used=grown(t.used, n),
             room=grown(t.room, n),
@@ -248,18 +253,9 @@ class TensorMassModel:
             self.rebuild()
 
     def _gather(self, nodes: np.ndarray) -> None:
-        m = self.material
-        remaining = nodes
+        mesh, remaining = self._mesh, nodes
         while len(remaining):
-            full = gather_rows(
-                self.tensors,
-                self.mesh.links,
-                self.mesh.rest,
-                remaining,
-                m.lame_lambda,
-                m.lame_mu,
-                m.density,
-            )
+            full = gather_rows(self.tensors, mesh.links, mesh.rest, remaining, *self._lame)
             if full < 0:
                 return
             self._give_room(int(remaining[full]))
@@ -277,42 +273,8 @@ class TensorMassModel:
         self._used += room
 
     @property
-    def mass(self) -> np.ndarray:
-        """Lumped masses [kg], shape (n,); a view."""
-        return self.tensors.mass[: self.mesh.node_count]
-
-    @property
-    def operands(self) -> tuple[np.ndarray, ...]:
-        """What `multiply` takes before u and f: start, used, columns, blocks, diagonal (flat)."""
-        n = self.mesh.node_count
+    def operands(self) -> Rows:
+        """What `add_rows` takes."""
+        n = self._mesh.node_count
         t = self.tensors
-        return t.start[:n], t.used[:n], t.columns, t.blocks, t.diagonal[:n].ravel()
-
-    def force(self, u: np.ndarray) -> np.ndarray:
-        """Elastic force K u that resists a displacement (the internal force is its negative).
-
-        Args:
-            u: displacement [m], shape (n, 3).
-
-        Returns:
-            [N], shape (n, 3).
-        """
-        f = np.empty(3 * self.mesh.node_count)
-        multiply(*self.operands, np.ascontiguousarray(u, float).ravel(), f)
-        return f.reshape(-1, 3)
-
-    def dense(self) -> np.ndarray:
-        """The stiffness matrix [N/m], shape (3 n, 3 n); for small meshes and tests."""
-        n = self.mesh.node_count
-        t = self.tensors
-        k = np.zeros((3 * n, 3 * n))
-        xx, xy, xz, yy, yz, zz = t.diagonal[:n].T
-        nodes = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
-        for i in range(n):
-            k[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = nodes[i]
-            for slot in range(t.start[i], t.start[i] + t.used[i]):
-                j = int(t.columns[slot])
-                block = t.blocks[9 * slot : 9 * slot + 9].reshape(3, 3)
-                k[3 * i : 3 * i + 3, j : j + 3] = block
-                k[j : j + 3, 3 * i : 3 * i + 3] = block.T
-        return k
+        return Rows(t.start[:n], t.used[:n], t.columns, t.blocks, t.diagonal[:n].ravel())

@@ -5,10 +5,11 @@ from itertools import permutations
 import numpy as np
 
 from tissue_sim.blade import Resistance
+from tissue_sim.contact import State, ToolContact
 from tissue_sim.locate import distance_to_triangles, locate_points
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, TopologyDelta
-from tissue_sim.simulation import State, TissueSimulation, ToolContact
+from tissue_sim.simulation import TissueSimulation
 
 _FRAMES = 40
 

@@ -1,0 +1,281 @@
+"""Strains averaged over the nodes: what cures linear tetrahedra of locking.
+
+Smoothed finite elements over nodes (Liu et al. 2009): the domain of a node is a quarter of each of
+its elements, and its displacement gradient their mean by volume,
+
+    H_i = sum_j u_j G_ij^T,    G_ij = sum over elements t of i and j of V_t g_tj / sum of V_t.
+
+Row i needs the star of node i only, so a cut recomputes the rows of the nodes it touched, and a
+domain ends at the lips of a cut. The forces V_i P_i G_ij go out over the same row, while it is in
+cache.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from tissue_sim.mesh import TetMesh, grown
+from tissue_sim.rotation import (
+    ENERGY,
+    LANES,
+    ROTATION,
+    SAFE_MATH,
+    SHEAR,
+    SLOTS,
+    VOLUMETRIC,
+    settle,
+    stress,
+    turn,
+)
+from tissue_sim.tensor_mass import shape_gradients
+
+_SLACK = 4
+
+
+class Domains(NamedTuple):
+    """Rows of the averaged gradients; row i of a node spans `start[i]` to `start[i] + used[i]`.
+
+    Attributes:
+        start, used, room: first slot, used slots and slots of each row, shape (n,).
+        columns: three times the node j of each entry, the node itself among them, shape (c,).
+        vectors: G_ij [1/m], shape (3 c,).
+        volume: of the domains [m^3], shape (n,).
+        rotation: quaternions, shape (n, 4).
+        lame: lambda and mu [Pa], shape (2,).
+    """
+
+    start: np.ndarray
+    used: np.ndarray
+    room: np.ndarray
+    columns: np.ndarray
+    vectors: np.ndarray
+    volume: np.ndarray
+    rotation: np.ndarray
+    lame: np.ndarray
+
+
+@njit(cache=True)
+def gather_domains(domains, links, rest, nodes):
+    """Computes the rows of some nodes from their stars; their rotations begin at none.
+
+    Args:
+        domains: written for `nodes` only.
+        links: connectivity.
+        rest: rest positions [m], shape (n, 3).
+        nodes: which rows, shape (r,).
+
+    Returns:
+        Index into `nodes` of the first whose row has no room, or -1.
+    """
+    g = np.empty((4, 3))
+    for which in range(len(nodes)):
+        node = nodes[which]
+        first = domains.start[node]
+        used = 0
+        total = 0.0
+        corner = links.first_corner[node]
+        while corner >= 0:
+            tet = corner // 4
+            volume = shape_gradients(rest, links.tetrahedra, tet, g)
+            total += volume
+            for b in range(4):
+                column = 3 * links.tetrahedra[tet, b]
+                slot = first
+                while slot < first + used and domains.columns[slot] != column:
+                    slot += 1
+                if slot == first + used:
+                    if used == domains.room[node]:
+                        return which
+                    used += 1
+                    domains.columns[slot] = column
+                    for i in range(3):
+                        domains.vectors[3 * slot + i] = 0.0
+                for i in range(3):
+                    domains.vectors[3 * slot + i] += volume * g[b, i]
+            corner = links.corner_next[corner]
+        domains.used[node] = used
+        domains.volume[node] = 0.25 * total
+        for slot in range(3 * first, 3 * (first + used)):
+            domains.vectors[slot] /= total
+        domains.rotation[node] = 0.0
+        domains.rotation[node, 0] = 1.0
+    return -1
+
+
+_U1, _U2, _U3 = (np.uint64(i) for i in (1, 2, 3))
+
+
+@njit(cache=True, fastmath=SAFE_MATH, error_model='numpy')
+def _average(domains, u, i, lane, chunk, unit):
+    """Puts the averaged gradient of a node in a lane."""
+    L = LANES
+    h0 = h1 = h2 = h3 = h4 = h5 = h6 = h7 = h8 = 0.0
+    first = np.uint64(domains.start[i])
+    columns, vectors = domains.columns, domains.vectors
+    for k in range(first, first + np.uint64(domains.used[i])):
+        j = np.uint64(columns[k])
+        q = _U3 * np.uint64(k)
+        a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
+        x, y, z = u[j], u[j + _U1], u[j + _U2]
+        h0 += x * a
+        h1 += x * b
+        h2 += x * c
+        h3 += y * a
+        h4 += y * b
+        h5 += y * c
+        h6 += z * a
+        h7 += z * b
+        h8 += z * c
+    chunk[lane], chunk[lane + L], chunk[lane + 2 * L] = unit + h0, h1, h2
+    chunk[lane + 3 * L], chunk[lane + 4 * L], chunk[lane + 5 * L] = h3, unit + h4, h5
+    chunk[lane + 6 * L], chunk[lane + 7 * L], chunk[lane + 8 * L] = h6, h7, unit + h8
+    chunk[lane + SHEAR * L] = 2.0 * domains.lame[1] * domains.volume[i]
+    chunk[lane + VOLUMETRIC * L] = domains.lame[0] * domains.volume[i]
+    for k in range(4):
+        chunk[lane + (ROTATION + k) * L] = domains.rotation[i, k]
+
+
+@njit(cache=True, fastmath=SAFE_MATH, error_model='numpy')
+def _spread(domains, i, lane, chunk, f):
+    """Adds the forces V P G_ij of a lane over the row of a node."""
+    L = LANES
+    p0, p1, p2 = chunk[lane], chunk[lane + L], chunk[lane + 2 * L]
+    p3, p4, p5 = chunk[lane + 3 * L], chunk[lane + 4 * L], chunk[lane + 5 * L]
+    p6, p7, p8 = chunk[lane + 6 * L], chunk[lane + 7 * L], chunk[lane + 8 * L]
+    first = np.uint64(domains.start[i])
+    columns, vectors = domains.columns, domains.vectors
+    for k in range(first, first + np.uint64(domains.used[i])):
+        j = np.uint64(columns[k])
+        q = _U3 * np.uint64(k)
+        a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
+        f[j] += p0 * a + p1 * b + p2 * c
+        f[j + _U1] += p3 * a + p4 * b + p5 * c
+        f[j + _U2] += p6 * a + p7 * b + p8 * c
+
+
+@njit(cache=True, error_model='numpy')
+def add_domains(domains, awake, u, f, turns, unit):
+    """Adds the forces of the domains.
+
+    Args:
+        domains: the rows; their rotations follow u by `turns` steps.
+        awake: intervals of nodes whose domains count, shape (s, 2).
+        u: displacement by coordinate [m], shape (3 n,).
+        f: added to [N], shape (3 n,).
+        turns: steps of the rotations; negative: until they have settled.
+        unit: 1 for forces, 0 for the product of the stiffness, rotations as they are, with u.
+
+    Returns:
+        Their elastic energy [J].
+    """
+    chunk = np.zeros(SLOTS * LANES)
+    energy = 0.0
+    for i in range(ROTATION * LANES, (ROTATION + 1) * LANES):
+        chunk[i] = 1.0
+    n = domains.used.shape[0]
+    for s in range(awake.shape[0]):
+        for low in range(awake[s, 0], min(n, awake[s, 1]), LANES):
+            high = min(low + LANES, n, awake[s, 1])
+            for i in range(low, high):
+                _average(domains, u, i, i - low, chunk, unit)
+            for _ in range(turns):
+                turn(chunk)
+            if turns < 0:
+                settle(chunk, 1e-14, 100)
+            if turns != 0:
+                for i in range(low, high):
+                    for k in range(4):
+                        domains.rotation[i, k] = chunk[i - low + (ROTATION + k) * LANES]
+            stress(chunk, unit)
+            for i in range(low, high):
+                energy += chunk[i - low + ENERGY * LANES]
+                _spread(domains, i, i - low, chunk, f)
+    return energy
+
+
+class NodeDomains:
+    """The domains of a mesh that is cut.
+
+    Args:
+        mesh: the mesh; followed by `update`.
+        lame_lambda, lame_mu: [Pa].
+    """
+
+    def __init__(self, mesh: TetMesh, lame_lambda: float, lame_mu: float) -> None:
+        self._mesh = mesh
+        self._lame = np.array([lame_lambda, lame_mu])
+        self.rebuild()
+
+    def rebuild(self) -> None:
+        """Computes every row anew, packed in the order of the nodes."""
+        n = self._mesh.node_count
+        tets = self._mesh.tetrahedra.astype(np.int64)
+        pairs = [tets[:, [i, j]] for i in range(4) for j in range(4)]
+        both = np.concatenate(pairs)
+        entries = np.unique(both[:, 0] * n + both[:, 1])
+        room = np.bincount(entries // n, minlength=n) + _SLACK
+        slots = int(room.sum())
+        self._domains = Domains(
+            np.concatenate([[0], np.cumsum(room)[:-1]]),
+            np.zeros(n, np.int64),
+            room,
+            np.zeros(slots, np.uint32),
+            np.zeros(3 * slots),
+            np.zeros(n),
+            np.zeros((n, 4)),
+            self._lame,
+        )
+        self._used = slots
+        self._gather(np.arange(n))
+
+    def update(self, nodes: np.ndarray) -> None:
+        """Computes the rows of the nodes that a change of connectivity touched, and no other.
+
+        Args:
+            nodes: `Touched.nodes` of the batch, shape (r,).
+        """
+        n, d = self._mesh.node_count, self._domains
+        known = len(d.room)
+        self._domains = d._replace(
+            **{
+                name: grown(getattr(d, name), n)
+                for name in ('start', 'used', 'room', 'volume', 'rotation')
+            }
+        )
+        if len(self._domains.room) > known:
+            self._domains.room[known:] = 0
+        self._gather(np.asarray(nodes, np.int64))
+        if self._used > 4 * int(self._domains.used[:n].sum()) + 4096:
+            self.rebuild()
+
+    def _gather(self, nodes: np.ndarray) -> None:
+        while len(nodes):
+            full = gather_domains(self._domains, self._mesh.links, self._mesh.rest, nodes)
+            if full < 0:
+                return
+            self._give_room(int(nodes[full]))
+            nodes = nodes[full:]
+
+    def _give_room(self, node: int) -> None:
+        room = 2 * int(self._domains.room[node]) + 16
+        d = self._domains
+        self._domains = d._replace(
+            columns=grown(d.columns, self._used + room),
+            vectors=grown(d.vectors, 3 * (self._used + room)),
+        )
+        self._domains.start[node] = self._used
+        self._domains.room[node] = room
+        self._used += room
+
+    @property
+    def operands(self) -> Domains:
+        """What `add_domains` takes: the rows of the nodes there are."""
+        n, d = self._mesh.node_count, self._domains
+        return d._replace(
+            start=d.start[:n],
+            used=d.used[:n],
+            room=d.room[:n],
+            volume=d.volume[:n],
+            rotation=d.rotation[:n],
+        )

@@ -1,0 +1,320 @@
+"""The tissue's motion from frame to frame: model, integrator, step, active region, guard."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tissue_sim.active_region import ActiveRegion, ActiveSettings
+from tissue_sim.compliance import solve_static
+from tissue_sim.coupling import FREE, Coupling
+from tissue_sim.elasticity import ElasticModel, ModelName
+from tissue_sim.guard import Guard
+from tissue_sim.integrators import Integrator, IntegratorName
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh, TopologyDelta, Touched, grown, interpolated
+from tissue_sim.stability import FrequencyBound, step_bound
+
+_AT_REST = 1e-9
+"""[m/s] below which a tissue that nothing touches is at rest, when it stays so."""
+_STILL_FRAMES = 10
+_FINER = 4
+_ATTEMPTS = 3
+_CAUTIOUS_FRAMES = 30
+
+
+@dataclass(frozen=True)
+class TimeStepping:
+    """How frames are stepped through.
+
+    Attributes:
+        integrator: which one.
+        rate: frames a second [Hz].
+        safety: share of the stable step that is used.
+        min_substeps, max_substeps: of a frame; when the largest number does not suffice the frame
+            simulates less time than it lasts.
+        frequency_growth: how far cuts may raise the highest frequency before small nodes are
+            integrated with more mass (see `FrequencyBound`); infinite: never.
+    """
+
+    integrator: IntegratorName = 'rk4'
+    rate: float = 30.0
+    safety: float = 0.8
+    min_substeps: int = 1
+    max_substeps: int = 200
+    frequency_growth: float = 3.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a frame of motion came to.
+
+    Attributes:
+        elastic_force: that resists the displacement [N], shape (n, 3).
+        kinetic_energy, elastic_energy: [J].
+        substeps: how many.
+        slow_motion: simulated time over frame time.
+        trouble: what went wrong; empty: nothing.
+        diverged: shorter steps did not help, and the frame was taken back.
+    """
+
+    elastic_force: np.ndarray
+    kinetic_energy: float
+    elastic_energy: float
+    substeps: int
+    slow_motion: float
+    trouble: str = ''
+    diverged: bool = False
+
+
+class Dynamics:
+    """Displacement and velocity of the tissue, and what moves them.
+
+    Args:
+        mesh: the tissue; changed by `apply_cut` only.
+        material: its constants.
+        model: its elasticity.
+        stepping: how frames are stepped through.
+        active: which nodes move.
+
+    Raises:
+        ValueError: the integrator has no stable step with this damping.
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        material: Material,
+        model: ModelName = 'linear',
+        stepping: TimeStepping | None = None,
+        active: ActiveSettings | None = None,
+    ) -> None:
+        self.mesh = mesh
+        self.material = material
+        self.model = ElasticModel(mesh, material, model)
+        self.stepping = stepping or TimeStepping()
+        self._frame_time = 1.0 / self.stepping.rate
+        self._integrator = Integrator(self.stepping.integrator, material.alpha, material.beta)
+        size = 3 * mesh.node_count
+        self._u, self._v = np.zeros(size), np.zeros(size)
+        self._inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / self.model.mass), 3)
+        self._inertia = self.model.mass.copy()
+        self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
+        self._bounds: dict[float, float] = {}
+        self._still = 0
+        self._caution = 1
+        self._cautious = 0
+        self._guard = Guard(mesh, material.youngs_modulus)
+        self._active = ActiveRegion(self.model, active or ActiveSettings())
+        if self.bound() == 0.0:
+            raise ValueError(
+                f'{self.stepping.integrator} has no stable step with damping alpha '
+                f'{material.alpha:g} 1/s and beta {material.beta:g} s: damp the tissue, or take '
+                'another integrator'
+            )
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """Displacements [m], shape (n, 3); a view."""
+        return self._u[: 3 * self.mesh.node_count].reshape(-1, 3)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities [m/s], shape (n, 3); a view."""
+        return self._v[: 3 * self.mesh.node_count].reshape(-1, 3)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Current node positions [m], shape (n, 3); a new array."""
+        return self.mesh.rest + self.displacement
+
+    @property
+    def omega(self) -> float:
+        """Bound of the highest frequency that steps are chosen by [rad/s]."""
+        return self._frequency.omega
+
+    @property
+    def inverse_mass(self) -> np.ndarray:
+        """By coordinate, 0 where fixed [1/kg], shape (3 n,); a view."""
+        return self._inverse[: 3 * self.mesh.node_count]
+
+    @property
+    def active_nodes(self) -> int:
+        """How many nodes move at present."""
+        return self._active.count
+
+    @property
+    def inverted(self) -> int:
+        """How many tetrahedra are turned inside out."""
+        return self._guard.inverted(self.displacement)
+
+    def stretch(self, stretch: np.ndarray) -> None:
+        """Moves the fixed nodes apart and all others to where they are then in equilibrium.
+
+        Args:
+            stretch: along x, y and z (0.05: by 5 %), shape (3,).
+        """
+        fixed = self.mesh.fixed == 1
+        middle = self.mesh.rest[fixed].mean(axis=0)
+        u = self.displacement
+        u[:] = (self.mesh.rest - middle) * stretch
+        first = 0.0
+        for _ in range(50 if self.model.rotating else 1):
+            residual = -self.model.force(u)
+            size = float(np.linalg.norm(residual[~fixed]))
+            first = first or size
+            if size < 1e-10 * first:
+                break
+            u[~fixed] += solve_static(self.model, self.inverse_mass > 0, residual)[~fixed]
+        self._guard.open(self.model.evaluate(u)[1])
+
+    def bound(self, coupling: Coupling | None = None) -> float:
+        """The largest stable step [s], the coupling spring's stiffness included."""
+        square = self._frequency.omega**2
+        if coupling is not None and coupling.mode != FREE:
+            inverse = self.inverse_mass[3 * coupling.nodes]
+            square += coupling.stiffness * float(np.sum(coupling.weights**2 * inverse))
+        # Rounded up, so that few different bounds are ever computed.
+        omega = 1.01 ** np.ceil(np.log(np.sqrt(square)) / np.log(1.01))
+        if omega not in self._bounds:
+            m = self.material
+            self._bounds[omega] = step_bound(self.stepping.integrator, omega, m.alpha, m.beta)
+        return self._bounds[omega]
+
+    def _substeps(self, coupling: Coupling) -> tuple[int, float]:
+        dt = self.stepping.safety * self.bound(coupling) / self._caution
+        substeps = max(int(np.ceil(self._frame_time / dt)), self.stepping.min_substeps)
+        substeps = max(substeps, self._caution)
+        if substeps > self.stepping.max_substeps * self._caution:
+            return self.stepping.max_substeps * self._caution, dt
+        return substeps, self._frame_time / substeps
+
+    def advance(self, coupling: Coupling) -> Motion:
+        """Moves the tissue by a frame; a frame that diverges is tried again with shorter steps.
+
+        Args:
+            coupling: the tool's spring.
+        """
+        self._frequency.refine()
+        if self._cautious:
+            self._cautious -= 1
+            self._caution = self._caution if self._cautious else 1
+        substeps, dt = self._substeps(coupling)
+        before = (self._u.copy(), self._v.copy())
+        trouble = ''
+        for _ in range(_ATTEMPTS):
+            work = self._integrate(coupling, dt, substeps)
+            motion = self._motion(dt, substeps, trouble)
+            energy = motion.kinetic_energy + motion.elastic_energy
+            found = self._guard.trouble(self.displacement, energy, work)
+            if not found:
+                return motion
+            trouble = trouble or f'{found}: {self._cause(coupling, dt)}'
+            self._u, self._v = before[0].copy(), before[1].copy()
+            self._caution *= _FINER
+            self._cautious = _CAUTIOUS_FRAMES
+            substeps, dt = substeps * _FINER, dt / _FINER
+        self._v[:] = 0.0
+        self._caution = 1
+        force, elastic = self.model.evaluate(self.displacement)
+        self._guard.open(elastic)
+        return Motion(np.zeros_like(force), 0.0, 0.0, substeps, 0.0, trouble, diverged=True)
+
+    def _integrate(self, coupling: Coupling, dt: float, substeps: int) -> float:
+        size = 3 * self.mesh.node_count
+        moving = self._v[:size]
+        if coupling.mode == FREE and float(np.abs(moving).max()) < _AT_REST:
+            # Decay would go on into denormal numbers, at a hundred times the cost.
+            if self._still >= _STILL_FRAMES:
+                moving[:] = 0.0
+                return 0.0
+            self._still += 1
+        else:
+            self._still = 0
+        spring = coupling.spring(self.mesh.rest)
+        work, done = 0.0, 0
+        for steps in self._active.blocks(substeps):
+            region = self._active.choose(
+                self._u[:size], moving, self.inverse_mass, coupling, self._frame_time
+            )
+            work += self._integrator.step(
+                region.operands,
+                self.inverse_mass,
+                self.model.diagonal,
+                spring,
+                self._u[:size],
+                moving,
+                dt,
+                steps,
+                spans=region.spans,
+                first=done,
+                total=substeps,
+            )
+            done += steps
+        return work
+
+    def _motion(self, dt: float, substeps: int, trouble: str) -> Motion:
+        v = self.velocity
+        force, elastic = self.model.evaluate(self.displacement)
+        kinetic = 0.5 * float(self._inertia[: len(v)] @ np.square(v).sum(axis=1))
+        slow = dt * substeps / self._frame_time
+        return Motion(force, kinetic, elastic, substeps, slow, trouble)
+
+    def _cause(self, coupling: Coupling, dt: float) -> str:
+        name, bound = self.stepping.integrator, self.bound(coupling)
+        if dt > bound:
+            return (
+                f'a step of {1e3 * dt:.3g} ms is above the {1e3 * bound:.3g} ms at which {name} '
+                f'is stable at {self.omega:.4g} rad/s'
+            )
+        inverted = self.inverted
+        if inverted:
+            return f'{inverted} of {len(self.mesh.tetrahedra)} tetrahedra are inside out'
+        return (
+            f'a step of {1e3 * dt:.3g} ms is below the {1e3 * bound:.3g} ms at which {name} is '
+            f'stable, so the tissue has been deformed beyond what the {self.model.name} model bears'
+        )
+
+    def apply_cut(self, delta: TopologyDelta) -> Touched:
+        """Carries a change of connectivity out; displacement and velocity are interpolated.
+
+        Args:
+            delta: the answer of the cutting service.
+
+        Returns:
+            What was written.
+
+        Raises:
+            MeshError: the change does not fit the mesh.
+        """
+        self._still = 0
+        n, total = self.mesh.node_count, self.mesh.node_count + len(delta.node_parents)
+        touched = self.mesh.apply(delta)
+        self._u, self._v = grown(self._u, 3 * total), grown(self._v, 3 * total)
+        for values in (self._u, self._v):
+            rows = values[: 3 * total].reshape(-1, 3)
+            new = interpolated(rows, delta.node_parents, delta.node_weights)
+            moved = interpolated(rows, delta.moved_parents, delta.moved_weights)
+            rows[n:total] = new
+            rows[np.asarray(delta.moved_nodes, np.int64)] = moved
+            for target, source in touched.renumbered:
+                rows[target] = rows[source]
+        self.model.update(touched)
+        self._follow_cut(touched.nodes)
+        return touched
+
+    def _follow_cut(self, nodes: np.ndarray) -> None:
+        """Brings what is kept by node up to date where a cut touched it, nodes of shape (r,)."""
+        n = self.mesh.node_count
+        if len(self._inertia) < n:
+            self._inertia = grown(self._inertia, n)
+            self._inverse = grown(self._inverse, 3 * len(self._inertia))
+        self._frequency.update(nodes, self.inverse_mass)
+        self._inertia[nodes] = self._frequency.inertia(nodes)
+        free = self.mesh.fixed[nodes] == 0
+        inverse = np.where(free, 1.0 / self._inertia[nodes], 0.0)
+        self.inverse_mass.reshape(-1, 3)[nodes] = inverse[:, None]
+        self._active.follow_cut(nodes)
+        # The rotations of what is new begin here, where they would else begin in the next step.
+        elastic = self.model.evaluate(self.displacement)[1]
+        v = self.velocity
+        self._guard.open(elastic + 0.5 * float(self._inertia[:n] @ np.square(v).sum(axis=1)))

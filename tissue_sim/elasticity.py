@@ -1,0 +1,338 @@
+"""The elastic models, one protocol: sums of tensors, node domains and corotational elements.
+
+| model | tensors (lambda, mu) | domains | elements | turns |
+|---|---|---|---|---|
+| linear | all | | | no |
+| linear_smoothed | 0, w mu | lambda, (1 - w) mu | | no |
+| corotational | | | all | yes |
+| corotational_smoothed | | lambda, (1 - w) mu | 0, w mu | yes |
+
+with w = PLAIN_SHARE. What a model has none of costs nothing, so that one kernel serves them all.
+"""
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numba import njit
+
+from tissue_sim.corotational import CorotationalElements, Elements, add_elements
+from tissue_sim.domains import Domains, NodeDomains, add_domains
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh, Touched, grown
+from tissue_sim.rotation import LANES
+from tissue_sim.tensor_mass import Rows, TensorMass, add_rows, shape_gradients
+
+ModelName = Literal['linear', 'linear_smoothed', 'corotational', 'corotational_smoothed']
+MODELS: tuple[ModelName, ...] = get_args(ModelName)
+
+PLAIN_SHARE = 0.2
+"""Part of the shear stiffness that smoothed models leave to the elements.
+
+Averages over nodes alone do not see some short waves. With this part K is at least w times that
+of plain elements without lambda, which has the six rigid motions and no other zero mode.
+"""
+
+
+class Operands(NamedTuple):
+    """What the kernels take of a model.
+
+    Attributes:
+        rows: tensors; no rows if there are none.
+        domains: of the nodes; none likewise.
+        elements: corotational ones; none likewise.
+        rotating: 1 if domains and elements turn with the tissue, else 0.
+        awake: intervals of nodes whose rows and domains are evaluated, shape (s, 2).
+        chunks: of elements that are evaluated, shape (k,).
+    """
+
+    rows: Rows
+    domains: Domains
+    elements: Elements
+    rotating: int
+    awake: np.ndarray
+    chunks: np.ndarray
+
+
+@njit(cache=True, error_model='numpy')
+def internal_force(operands, u, f, turns):
+    """Elastic force that resists a displacement.
+
+    Args:
+        operands: of the model; its rotations, if any, follow u.
+        u: displacement by coordinate [m], shape (3 n,).
+        f: output [N], right at nodes all of whose neighbours are awake, shape (3 n,).
+        turns: steps of the rotations; negative: until they have settled.
+
+    Returns:
+        Elastic energy of domains and elements [J].
+    """
+    for i in range(f.shape[0]):
+        f[i] = 0.0
+    add_rows(operands.rows, operands.awake, u, f)
+    energy = 0.0
+    steps = turns if operands.rotating else 0
+    unit = 1.0 if operands.rotating else 0.0
+    if operands.domains.used.shape[0] > 0:
+        energy += add_domains(operands.domains, operands.awake, u, f, steps, unit)
+    if operands.chunks.shape[0] > 0:
+        energy += add_elements(operands.elements, operands.chunks, u, f, steps, unit)
+    return energy
+
+
+@njit(cache=True, error_model='numpy')
+def stiffness_product(operands, x, f):
+    """Product f = K x with the stiffness under the rotations as they are.
+
+    Args:
+        operands: of the model.
+        x: by coordinate, shape (3 n,).
+        f: output, shape (3 n,).
+    """
+    for i in range(f.shape[0]):
+        f[i] = 0.0
+    add_rows(operands.rows, operands.awake, x, f)
+    if operands.domains.used.shape[0] > 0:
+        add_domains(operands.domains, operands.awake, x, f, 0, 0.0)
+    if operands.chunks.shape[0] > 0:
+        add_elements(operands.elements, operands.chunks, x, f, 0, 0.0)
+
+
+@njit(cache=True)
+def gather_stars(links, rest, nodes, constants, mass, diagonal, norms):
+    """Masses, diagonal and norm of the rows of plain elements at some nodes, from their stars.
+
+    Args:
+        links: connectivity.
+        rest: rest positions [m], shape (n, 3).
+        nodes: which, shape (r,).
+        constants: lambda [Pa], mu [Pa], density [kg/m^3].
+        mass: output [kg] (thesis eq. 4.2), shape (>= n,).
+        diagonal: output [N/m], shape (>= 3 n,).
+        norms: output, sums of the Frobenius norms of the element blocks K_ij of row i [N/m],
+            which rotations of elements do not change, shape (>= n,).
+    """
+    lame_lambda, lame_mu, density = constants[0], constants[1], constants[2]
+    g = np.empty((4, 3))
+    for node in nodes:
+        mass[node] = 0.0
+        norms[node] = 0.0
+        for i in range(3):
+            diagonal[3 * node + i] = 0.0
+        corner = links.first_corner[node]
+        while corner >= 0:
+            a = corner % 4
+            volume = shape_gradients(rest, links.tetrahedra, corner // 4, g)
+            mass[node] += 0.25 * density * volume
+            dot = volume * lame_mu * (g[a, 0] * g[a, 0] + g[a, 1] * g[a, 1] + g[a, 2] * g[a, 2])
+            both = volume * (lame_lambda + lame_mu)
+            for i in range(3):
+                diagonal[3 * node + i] += both * g[a, i] * g[a, i] + dot
+            for b in range(4):
+                dot = g[a, 0] * g[b, 0] + g[a, 1] * g[b, 1] + g[a, 2] * g[b, 2]
+                square = 0.0
+                for i in range(3):
+                    for k in range(3):
+                        value = lame_lambda * g[a, i] * g[b, k] + lame_mu * g[b, i] * g[a, k]
+                        if i == k:
+                            value += lame_mu * dot
+                        square += value * value
+                norms[node] += volume * np.sqrt(square)
+            corner = links.corner_next[corner]
+
+
+@njit(cache=True)
+def assembled_norms(tensors, links, nodes, norms):
+    """Sums of the Frobenius norms of the assembled 3x3 blocks of some rows.
+
+    Args:
+        tensors: a `tensor_mass.Tensors`.
+        links: connectivity.
+        nodes: which rows, shape (r,).
+        norms: output [N/m], shape (>= n,).
+    """
+    seen = np.empty(256, np.int64)
+    for which in range(len(nodes)):
+        node = nodes[which]
+        d = tensors.diagonal[node]
+        total = np.sqrt(d[0] ** 2 + d[3] ** 2 + d[5] ** 2 + 2 * (d[1] ** 2 + d[2] ** 2 + d[4] ** 2))
+        number = 0
+        corner = links.first_corner[node]
+        while corner >= 0:
+            for b in range(4):
+                other = links.tetrahedra[corner // 4, b]
+                new = other != node
+                for k in range(number):
+                    if seen[k] == other:
+                        new = False
+                if new:
+                    total += _edge_norm(tensors, min(node, other), max(node, other))
+                    if number < 256:
+                        seen[number] = other
+                        number += 1
+            corner = links.corner_next[corner]
+        norms[node] = total
+
+
+@njit(cache=True)
+def _edge_norm(tensors, low, high):
+    for slot in range(tensors.start[low], tensors.start[low] + tensors.used[low]):
+        if tensors.columns[slot] == 3 * high:
+            square = 0.0
+            for i in range(9):
+                square += tensors.blocks[9 * slot + i] ** 2
+            return np.sqrt(square)
+    return 0.0
+
+
+_NO_ROWS = Rows(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint32), np.zeros(0), np.zeros(0)
+)
+_NO_DOMAINS = Domains(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint32),
+    np.zeros(0), np.zeros(0), np.zeros((0, 4)), np.zeros(2),
+)  # fmt: skip
+_NO_ELEMENTS = Elements(np.zeros(0, np.uint32), np.zeros(0))
+
+
+class ElasticModel:
+    """The elasticity of a mesh that is cut (docs/method.md, which says where each model fails).
+
+    Args:
+        mesh: the mesh; the model follows it by `update`.
+        material: its constants.
+        name: which model.
+    """
+
+    def __init__(self, mesh: TetMesh, material: Material, name: ModelName = 'linear') -> None:
+        self.mesh = mesh
+        self.material = material
+        self.name = name
+        self.rotating = name.startswith('corotational')
+        lam, mu = material.lame_lambda, material.lame_mu
+        smoothed = name.endswith('_smoothed')
+        plain = (0.0, PLAIN_SHARE * mu) if smoothed else (lam, mu)
+        self.tensor_mass = None if self.rotating else TensorMass(mesh, *plain)
+        self._elements = CorotationalElements(mesh, *plain) if self.rotating else None
+        self._domains = NodeDomains(mesh, lam, (1 - PLAIN_SHARE) * mu) if smoothed else None
+        self._assembled = name == 'linear'
+        self._mass = np.zeros(0)
+        self._diagonal = np.zeros(0)
+        self._norms = np.zeros(0)
+        self._gather(np.arange(mesh.node_count))
+
+    def update(self, touched: Touched) -> None:
+        """Computes anew what a change of connectivity touched, and nothing else.
+
+        Args:
+            touched: what the batch wrote.
+        """
+        if self.tensor_mass is not None:
+            self.tensor_mass.update(touched.nodes)
+        if self._domains is not None:
+            self._domains.update(touched.nodes)
+        if self._elements is not None:
+            stars = [self.mesh.star(int(node)) for node in touched.rest]
+            self._elements.update(np.concatenate([touched.tetrahedra, *stars]))
+        self._gather(touched.nodes)
+
+    def _gather(self, nodes: np.ndarray) -> None:
+        n, links = self.mesh.node_count, self.mesh.links
+        self._mass = grown(self._mass, n)
+        self._norms = grown(self._norms, n)
+        self._diagonal = grown(self._diagonal, 3 * len(self._mass))
+        m = self.material
+        constants = np.array([m.lame_lambda, m.lame_mu, m.density])
+        which = np.asarray(nodes, np.int64)
+        gather_stars(
+            links, self.mesh.rest, which, constants, self._mass, self._diagonal, self._norms
+        )
+        if self._assembled and self.tensor_mass is not None:
+            assembled_norms(self.tensor_mass.tensors, links, which, self._norms)
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Lumped masses [kg], shape (n,); a view."""
+        return self._mass[: self.mesh.node_count]
+
+    @property
+    def diagonal(self) -> np.ndarray:
+        """Of the stiffness of plain elements at rest [N/m], shape (3 n,); a view."""
+        return self._diagonal[: 3 * self.mesh.node_count]
+
+    def frequency_rows(self, nodes: np.ndarray) -> np.ndarray:
+        """Gershgorin's row sums of M^-1 K by 3x3 blocks: the largest bounds all eigenvalues.
+
+        A row depends on the star of its own node, so only rows that a cut touched change. Of
+        smoothed models it is the row of plain elements: averaging takes energy away (Jensen).
+
+        Args:
+            nodes: which rows, shape (r,).
+
+        Returns:
+            Squares of frequencies [1/s^2], shape (r,).
+        """
+        return np.asarray(self._norms[nodes] / self._mass[nodes])
+
+    def operands(
+        self, awake: np.ndarray | None = None, chunks: np.ndarray | None = None
+    ) -> Operands:
+        """What the kernels take.
+
+        Args:
+            awake: intervals of nodes, None: all, shape (s, 2).
+            chunks: of elements, None: all, shape (k,).
+        """
+        if awake is None:
+            awake = np.array([[0, self.mesh.node_count]])
+        if chunks is None:
+            chunks = np.arange(-(-len(self.mesh.tetrahedra) // LANES) if self._elements else 0)
+        return Operands(
+            self.tensor_mass.operands if self.tensor_mass else _NO_ROWS,
+            self._domains.operands if self._domains else _NO_DOMAINS,
+            self._elements.operands if self._elements else _NO_ELEMENTS,
+            int(self.rotating),
+            awake,
+            chunks,
+        )
+
+    def evaluate(self, u: np.ndarray) -> tuple[np.ndarray, float]:
+        """Elastic force that resists a displacement (the internal force is its negative).
+
+        Args:
+            u: displacement [m], shape (n, 3). Rotations follow it until they have settled.
+
+        Returns:
+            Force [N], shape (n, 3), and elastic energy [J].
+        """
+        f = np.empty(3 * self.mesh.node_count)
+        flat = np.ascontiguousarray(u, float).ravel()
+        energy = float(internal_force(self.operands(), flat, f, -1))
+        force = f.reshape(-1, 3)
+        return force, energy if self.rotating else 0.5 * float(np.sum(u * force))
+
+    def force(self, u: np.ndarray) -> np.ndarray:
+        """Elastic force that resists a displacement [N], shape (n, 3), see `evaluate`."""
+        return self.evaluate(u)[0]
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        """Stiffness, with rotations as they are, times some displacement.
+
+        Args:
+            x: [m], shape (n, 3).
+
+        Returns:
+            [N], shape (n, 3).
+        """
+        f = np.empty(3 * self.mesh.node_count)
+        stiffness_product(self.operands(), np.ascontiguousarray(x, float).ravel(), f)
+        return f.reshape(-1, 3)
+
+    def dense(self) -> np.ndarray:
+        """The stiffness matrix [N/m], shape (3 n, 3 n); for small meshes and tests."""
+        size = 3 * self.mesh.node_count
+        operands, k, x = self.operands(), np.empty((size, size)), np.zeros(size)
+        for i in range(size):
+            x[i] = 1.0
+            stiffness_product(operands, x, k[i])
+            x[i] = 0.0
+        return k
