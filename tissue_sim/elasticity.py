@@ -25,7 +25,7 @@ from tissue_sim.tensor_mass import Rows, TensorMass, add_rows, shape_gradients
 ModelName = Literal['linear', 'linear_smoothed', 'corotational', 'corotational_smoothed']
 MODELS: tuple[ModelName, ...] = get_args(ModelName)
 
-PLAIN_SHARE = 0.2
+PLAIN_SHARE = 0.3
 """Part of the shear stiffness that smoothed models leave to the elements.
 
 Averages over nodes alone do not see some short waves. With this part K is at least w times that
