@@ -19,8 +19,8 @@ from tissue_sim.mesh import TetMesh, grown
 from tissue_sim.rotation import (
     ENERGY,
     LANES,
+    ORDERED_MATH,
     ROTATION,
-    SAFE_MATH,
     SHEAR,
     SLOTS,
     VOLUMETRIC,
@@ -38,7 +38,8 @@ class Domains(NamedTuple):
 
     Attributes:
         start, used, room: first slot, used slots and slots of each row, shape (n,).
-        columns: three times the node j of each entry, the node itself among them, shape (c,).
+        columns: three times the node j of each entry, shape (c,). The node itself is among them
+            at the surface only: in the interior G_ii is 0.
         vectors: G_ij [1/m], shape (3 c,).
         volume: of the domains [m^3], shape (n,).
         rotation: quaternions, shape (n, 4).
@@ -53,6 +54,17 @@ class Domains(NamedTuple):
     volume: np.ndarray
     rotation: np.ndarray
     lame: np.ndarray
+
+
+@njit(cache=True)
+def _on_surface(links, node):
+    corner = links.first_corner[node]
+    while corner >= 0:
+        for local in range(4):
+            if local != corner % 4 and links.face_triangle[corner // 4, local] >= 0:
+                return True
+        corner = links.corner_next[corner]
+    return False
 
 
 @njit(cache=True)
@@ -74,12 +86,15 @@ def gather_domains(domains, links, rest, nodes):
         first = domains.start[node]
         used = 0
         total = 0.0
+        outside = _on_surface(links, node)
         corner = links.first_corner[node]
         while corner >= 0:
             tet = corner // 4
             volume = shape_gradients(rest, links.tetrahedra, tet, g)
             total += volume
             for b in range(4):
+                if b == corner % 4 and not outside:
+                    continue
                 column = 3 * links.tetrahedra[tet, b]
                 slot = first
                 while slot < first + used and domains.columns[slot] != column:
@@ -106,7 +121,7 @@ def gather_domains(domains, links, rest, nodes):
 _U1, _U2, _U3 = (np.uint64(i) for i in (1, 2, 3))
 
 
-@njit(cache=True, fastmath=SAFE_MATH, error_model='numpy')
+@njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
 def _average(domains, u, i, lane, chunk, unit):
     """Puts the averaged gradient of a node in a lane."""
     L = LANES
@@ -136,7 +151,7 @@ def _average(domains, u, i, lane, chunk, unit):
         chunk[lane + (ROTATION + k) * L] = domains.rotation[i, k]
 
 
-@njit(cache=True, fastmath=SAFE_MATH, error_model='numpy')
+@njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
 def _spread(domains, i, lane, chunk, f):
     """Adds the forces V P G_ij of a lane over the row of a node."""
     L = LANES
@@ -152,6 +167,49 @@ def _spread(domains, i, lane, chunk, f):
         f[j] += p0 * a + p1 * b + p2 * c
         f[j + _U1] += p3 * a + p4 * b + p5 * c
         f[j + _U2] += p6 * a + p7 * b + p8 * c
+
+
+@njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
+def add_still_domains(domains, awake, u, f):
+    """Adds the forces of domains that do not turn: linear in u.
+
+    Args:
+        domains: the rows.
+        awake: intervals of nodes whose domains count, shape (s, 2).
+        u: displacement by coordinate [m], shape (3 n,).
+        f: added to [N], shape (3 n,).
+    """
+    columns, vectors = domains.columns, domains.vectors
+    for s in range(awake.shape[0]):
+        for i in range(awake[s, 0], min(domains.used.shape[0], awake[s, 1])):
+            xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
+            first = np.uint64(domains.start[i])
+            for k in range(first, first + np.uint64(domains.used[i])):
+                j = np.uint64(columns[k])
+                q = _U3 * np.uint64(k)
+                a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
+                x, y, z = u[j], u[j + _U1], u[j + _U2]
+                xx += x * a
+                xy += x * b
+                xz += x * c
+                yx += y * a
+                yy += y * b
+                yz += y * c
+                zx += z * a
+                zy += z * b
+                zz += z * c
+            shear = domains.lame[1] * domains.volume[i]
+            pressure = domains.lame[0] * domains.volume[i] * (xx + yy + zz)
+            xx, yy = 2.0 * shear * xx + pressure, 2.0 * shear * yy + pressure
+            zz = 2.0 * shear * zz + pressure
+            xy, xz, yz = shear * (xy + yx), shear * (xz + zx), shear * (yz + zy)
+            for k in range(first, first + np.uint64(domains.used[i])):
+                j = np.uint64(columns[k])
+                q = _U3 * np.uint64(k)
+                a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
+                f[j] += xx * a + xy * b + xz * c
+                f[j + _U1] += xy * a + yy * b + yz * c
+                f[j + _U2] += xz * a + yz * b + zz * c
 
 
 @njit(cache=True, error_model='numpy')

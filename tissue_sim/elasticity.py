@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from tissue_sim.corotational import CorotationalElements, Elements, add_elements
-from tissue_sim.domains import Domains, NodeDomains, add_domains
+from tissue_sim.domains import Domains, NodeDomains, add_domains, add_still_domains
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, Touched, grown
 from tissue_sim.rotation import LANES
@@ -70,12 +70,12 @@ def internal_force(operands, u, f, turns):
         f[i] = 0.0
     add_rows(operands.rows, operands.awake, u, f)
     energy = 0.0
-    steps = turns if operands.rotating else 0
-    unit = 1.0 if operands.rotating else 0.0
-    if operands.domains.used.shape[0] > 0:
-        energy += add_domains(operands.domains, operands.awake, u, f, steps, unit)
+    if operands.domains.used.shape[0] > 0 and not operands.rotating:
+        add_still_domains(operands.domains, operands.awake, u, f)
+    elif operands.domains.used.shape[0] > 0:
+        energy += add_domains(operands.domains, operands.awake, u, f, turns, 1.0)
     if operands.chunks.shape[0] > 0:
-        energy += add_elements(operands.elements, operands.chunks, u, f, steps, unit)
+        energy += add_elements(operands.elements, operands.chunks, u, f, turns, 1.0)
     return energy
 
 
@@ -91,7 +91,9 @@ def stiffness_product(operands, x, f):
     for i in range(f.shape[0]):
         f[i] = 0.0
     add_rows(operands.rows, operands.awake, x, f)
-    if operands.domains.used.shape[0] > 0:
+    if operands.domains.used.shape[0] > 0 and not operands.rotating:
+        add_still_domains(operands.domains, operands.awake, x, f)
+    elif operands.domains.used.shape[0] > 0:
         add_domains(operands.domains, operands.awake, x, f, 0, 0.0)
     if operands.chunks.shape[0] > 0:
         add_elements(operands.elements, operands.chunks, x, f, 0, 0.0)

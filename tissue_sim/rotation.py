@@ -23,6 +23,8 @@ VOLUMETRIC = 14
 TURN = ENERGY = 15
 SAFE_MATH = {'contract', 'reassoc', 'arcp', 'nsz'}
 """What may be rearranged without losing NaN and infinity."""
+ORDERED_MATH = {'contract', 'arcp', 'nsz'}
+"""The same for short sums over scattered values, which gathers into vectors only slow down."""
 
 
 @njit(cache=True, fastmath=SAFE_MATH, error_model='numpy')
