@@ -104,7 +104,11 @@ class Dynamics:
         self._caution = 1
         self._cautious = 0
         self._guard = Guard(mesh, material.youngs_modulus)
-        self._active = ActiveRegion(self.model, active or ActiveSettings())
+        self._active = ActiveRegion(
+            self.model,
+            active or ActiveSettings(),
+            implicit=self.stepping.integrator == 'implicit',
+        )
         if self.bound() == 0.0:
             raise ValueError(
                 f'{self.stepping.integrator} has no stable step with damping alpha '
@@ -234,7 +238,11 @@ class Dynamics:
         work, done = 0.0, 0
         for steps in self._active.blocks(substeps):
             region = self._active.choose(
-                self._u[:size], moving, self.inverse_mass, coupling, self._frame_time
+                self._u[:size] + self.material.beta * moving,
+                moving,
+                self.inverse_mass,
+                coupling,
+                self._frame_time,
             )
             work += self._integrator.step(
                 region.operands,

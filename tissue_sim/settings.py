@@ -179,10 +179,10 @@ class ActiveRegion(SceneModel):
         default=2000, ge=1, le=10**7, description='how many move at most with budget [-], 1 to 1e7'
     )
     tolerance: float = Field(
-        default=1e-3,
+        default=1e-4,
         gt=0,
         le=1,
-        description='speed below which a node may sleep, of the fastest of late [-], above 0 to 1',
+        description='speed below which a node may sleep [m/s], above 0 to 1',
     )
 
 
