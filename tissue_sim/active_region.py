@@ -29,7 +29,7 @@ class ActiveSettings:
     """How the active region is chosen.
 
     Attributes:
-        mode: off (all nodes move), on, or budget (at most `nodes` of them, the nearest to the tool).
+        mode: off (all nodes move), on, or budget (at most `nodes`, the nearest to the tool).
         nodes: how many with `budget`.
         tolerance: speed [m/s] below which a node may sleep.
     """

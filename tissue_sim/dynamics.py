@@ -169,7 +169,7 @@ class Dynamics:
             if size < 1e-10 * first:
                 break
             u[~fixed] += solve_static(self.model, self.inverse_mass > 0, residual)[~fixed]
-        self._guard.open(self.model.evaluate(u)[1])
+        self.restart()
 
     def bound(self, coupling: Coupling | None = None) -> float:
         """The largest stable step [s], the coupling spring's stiffness included."""
@@ -310,6 +310,17 @@ class Dynamics:
         self._follow_cut(touched.nodes)
         return touched
 
+    def restart(self) -> None:
+        """Takes displacement and velocity as they are for the state that the next frame starts at.
+
+        Rotations settle in it, and the account of energy begins with it.
+        """
+        elastic = self.model.evaluate(self.displacement)[1]
+        v = self.velocity
+        kinetic = 0.5 * float(self._inertia[: len(v)] @ np.square(v).sum(axis=1))
+        self._guard.open(elastic + kinetic)
+        self._still = 0
+
     def _follow_cut(self, nodes: np.ndarray) -> None:
         """Brings what is kept by node up to date where a cut touched it, nodes of shape (r,)."""
         n = self.mesh.node_count
@@ -322,7 +333,4 @@ class Dynamics:
         inverse = np.where(free, 1.0 / self._inertia[nodes], 0.0)
         self.inverse_mass.reshape(-1, 3)[nodes] = inverse[:, None]
         self._active.follow_cut(nodes)
-        # The rotations of what is new begin here, where they would else begin in the next step.
-        elastic = self.model.evaluate(self.displacement)[1]
-        v = self.velocity
-        self._guard.open(elastic + 0.5 * float(self._inertia[:n] @ np.square(v).sum(axis=1)))
+        self.restart()

@@ -1,0 +1,190 @@
+"""What diverges is caught: shorter steps if they help, else no force, and a reason in words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from meshes import box, irregular_box
+from test_blade import contact_at
+
+from cutting.methods import make_method
+from cutting.settings import CuttingSettings
+from tissue_sim.blade import Resistance, Sweep
+from tissue_sim.dynamics import Dynamics, TimeStepping
+from tissue_sim.elasticity import MODELS, ModelName
+from tissue_sim.guard import Guard
+from tissue_sim.integrators import INTEGRATORS, IntegratorName
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh
+from tissue_sim.simulation import TissueSimulation
+
+every_model = pytest.mark.parametrize('name', MODELS)
+every_integrator = pytest.mark.parametrize('integrator', INTEGRATORS)
+RESISTANCE = Resistance(100.0, 40.0, 0.0)
+
+
+def simulation(
+    name: ModelName = 'linear',
+    integrator: IntegratorName = 'rk4',
+    *,
+    nu: float = 0.4,
+    safety: float = 0.8,
+    mesh: TetMesh | None = None,
+) -> TissueSimulation:
+    if mesh is None:
+        nodes, tets = box((12, 6, 4), 0.005)
+        mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    stepping = TimeStepping(
+        integrator, safety=safety, min_substeps=4 if integrator == 'implicit' else 1,
+        max_substeps=5000,
+    )  # fmt: skip
+    material = Material(5000.0, nu, 1000.0, 5.0, 2e-4)
+    return TissueSimulation(mesh, material, RESISTANCE, model=name, stepping=stepping)
+
+
+def press(tissue: TissueSimulation, frames: int, depth: float = 0.003) -> list[str]:
+    """Presses the tool in over eight frames and holds it; what went wrong, in words."""
+    troubles = []
+    for k in range(frames):
+        tip = np.array([0.03, 0.015, 0.0205 - depth * min(k / 8, 1.0)])
+        frame = tissue.frame(contact_at(tissue, tip))
+        assert np.isfinite(frame.force).all()
+        assert np.linalg.norm(frame.force) < 2.0
+        troubles += [frame.trouble] if frame.trouble else []
+    return troubles
+
+
+@every_integrator
+@every_model
+def test_the_default_share_of_the_step_gives_no_trouble(
+    name: ModelName, integrator: IntegratorName
+) -> None:
+    assert press(simulation(name, integrator), 10) == []
+
+
+@every_model
+@pytest.mark.parametrize('integrator', ['euler', 'symplectic_euler', 'rk4'])
+def test_a_step_above_the_limit_is_caught_named_and_mended(
+    name: ModelName, integrator: IntegratorName
+) -> None:
+    tissue = simulation(name, integrator, safety=1.5)
+    troubles = press(tissue, 12)
+    assert troubles
+    assert 'a step of' in troubles[0] and integrator in troubles[0] and 'rad/s' in troubles[0]
+    reference = simulation(name, integrator)
+    press(reference, 12)
+    np.testing.assert_allclose(
+        tissue.displacement, reference.displacement,
+        atol=0.05 * np.abs(reference.displacement).max(),
+    )  # fmt: skip
+
+
+def test_what_shorter_steps_do_not_mend_is_taken_back_with_no_force() -> None:
+    tissue = simulation()
+    press(tissue, 10)
+    before = tissue.displacement.copy()
+    tissue.velocity[:] = 1e5
+    frame = tissue.frame(contact_at(tissue, np.array([0.03, 0.015, 0.0175])))
+    assert frame.diverged
+    assert 'farther than the tissue is long' in frame.trouble
+    assert not frame.force.any()
+    assert np.array_equal(tissue.displacement, before)
+    assert press(tissue, 10) == []
+
+
+def test_forward_euler_without_damping_is_refused_in_words() -> None:
+    nodes, tets = box((2, 2, 2), 0.01)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    with pytest.raises(ValueError, match='no stable step with damping alpha 0'):
+        Dynamics(mesh, Material(5000.0, 0.4, 1000.0), 'linear', TimeStepping('euler'))
+
+
+def cut_block(name: ModelName, integrator: IntegratorName, method: str) -> TissueSimulation:
+    nodes, tets = irregular_box((6, 4, 3), 0.005, 3, jitter=0.15)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    tissue = simulation(name, integrator, mesh=mesh)
+    cutter = make_method(CuttingSettings.model_validate({'method': method}))
+    way = np.linspace(-0.002, 0.022, 7)
+    path = np.array([[[0.0137, y, 0.03], [0.0137, y, 0.0063]] for y in way])
+    for k in range(6):
+        result = cutter.advance(mesh, tissue.positions, Sweep(*path[k], *path[k + 1]))
+        if not result.delta.empty:
+            tissue.apply_cut(result.delta)
+        frame = tissue.frame(None)
+        assert not frame.trouble
+    tissue.apply_cut(cutter.finish(mesh, tissue.positions).delta)
+    return tissue
+
+
+@every_integrator
+@every_model
+def test_after_a_cut_through_elements_the_bound_holds_and_the_lips_come_to_rest(
+    name: ModelName, integrator: IntegratorName
+) -> None:
+    """Cut at the true crossings: the method that makes slivers."""
+    tissue = cut_block(name, integrator, 'subdivide')
+    dynamics = tissue.dynamics
+    root = np.sqrt(dynamics.inverse_mass)
+    true = np.sqrt(np.linalg.eigvalsh(root[:, None] * dynamics.model.dense() * root)[-1])
+    assert true < dynamics.omega
+    rng = np.random.default_rng(0)
+    free = tissue.mesh.fixed == 0
+    tissue.displacement[free] += 2e-5 * rng.normal(size=(int(free.sum()), 3))
+    dynamics.restart()
+    first = tissue.frame(None)
+    frames = [tissue.frame(None) for _ in range(25)]
+    assert not any(frame.trouble for frame in frames)
+    energies = [frame.kinetic_energy + frame.elastic_energy for frame in (first, *frames)]
+    assert energies[-1] < 0.2 * energies[0]
+
+
+@pytest.mark.parametrize('integrator', ['symplectic_euler', 'rk4', 'implicit'])
+@every_model
+def test_an_inverted_element_does_not_blow_up(name: ModelName, integrator) -> None:
+    tissue = simulation(name, integrator)
+    mesh = tissue.mesh
+    node = int(np.argmin(np.linalg.norm(mesh.rest - [0.03, 0.015, 0.02], axis=1)))
+    tissue.displacement[node] = [0.0, 0.0, -0.009]
+    tissue.dynamics.restart()
+    assert tissue.dynamics.inverted > 0
+    frames = [tissue.frame(None) for _ in range(60)]
+    assert not any(frame.diverged for frame in frames)
+    assert tissue.dynamics.inverted == 0
+    assert np.abs(tissue.displacement).max() < 1e-3
+
+
+@every_integrator
+@every_model
+def test_a_tool_that_jumps_through_the_tissue_is_not_believed(
+    name: ModelName, integrator: IntegratorName
+) -> None:
+    tissue = simulation(name, integrator)
+    press(tissue, 9)
+    there = contact_at(tissue, np.array([0.03, 0.015, 0.0175]))
+    jumped = replace(there, device=there.device - np.array([0.0, 0.0, 0.3]))
+    frame = tissue.frame(jumped)
+    assert not frame.force.any()
+    assert 'the tool has moved by 300 mm within a frame' in frame.trouble
+    # It stays there, pressing with 60 N: whatever comes of that is finite, or taken back.
+    for _ in range(5):
+        frame = tissue.frame(jumped)
+        assert np.isfinite(frame.force).all()
+        assert np.isfinite(tissue.displacement).all()
+        assert not frame.diverged or (frame.trouble and not frame.force.any())
+
+
+@every_model
+def test_near_incompressibility_only_shortens_the_step(name: ModelName) -> None:
+    assert press(simulation(name, nu=0.499), 10) == []
+
+
+def test_energy_from_nowhere_is_found_before_it_is_large() -> None:
+    nodes, tets = box((4, 4, 2), 0.01)
+    guard = Guard(TetMesh(nodes, tets), 5000.0)
+    u = np.zeros_like(nodes)
+    assert guard.trouble(u, 1e-4, 1e-4) == ''
+    assert guard.trouble(u, 0.9e-4, -0.1e-4) == ''
+    assert 'the tool has put in' in guard.trouble(u, 5e-4, 0.1e-4)
+    assert guard.trouble(u, 1.2e-4, 0.5e-4) == ''
+    u[0] = np.nan
+    assert 'farther' in guard.trouble(u, np.nan, 0.0)
