@@ -157,16 +157,29 @@ def subtract_spring(spring, at, u, f, out):
 
 
 @njit(cache=True)
-def spring_work(spring, force, u):
-    """Force times where the tissue's end has moved from rest [J]; differences are work.
+def spring_work(spring, force, u, last):
+    """Work on the tissue since the last call, by the mean of the forces then and now [J].
 
     Args:
         spring: see `Spring`.
-        force: on the tissue [N], shape (3,).
+        force: on the tissue now [N], shape (3,).
         u: displacement by coordinate [m], shape (3 n,).
+        last: force [N] and place [m] of the tissue's end at the last call; renewed, shape (2, 3).
     """
     work = 0.0
-    for c in range(spring.nodes.shape[0]):
-        for i in range(3):
-            work += force[i] * spring.weights[c] * u[3 * spring.nodes[c] + i]
+    for i in range(3):
+        place = 0.0
+        for c in range(spring.nodes.shape[0]):
+            place += spring.weights[c] * u[3 * spring.nodes[c] + i]
+        work += 0.5 * (force[i] + last[0, i]) * (place - last[1, i])
+        last[0, i] = force[i]
+        last[1, i] = place
     return work
+
+
+@njit(cache=True)
+def start_of_work(spring, u, last):
+    """Puts the present place of the tissue's end, and no force, in `last`; the work is 0 J."""
+    force = np.zeros(3)
+    spring_work(spring, force, u, last)
+    return 0.0

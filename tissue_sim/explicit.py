@@ -7,7 +7,7 @@ signature, that of `euler_steps`.
 import numpy as np
 from numba import njit
 
-from tissue_sim.coupling import spring_work, subtract_spring
+from tissue_sim.coupling import spring_work, start_of_work, subtract_spring
 from tissue_sim.elasticity import internal_force
 
 
@@ -36,8 +36,8 @@ def euler_steps(
     """
     alpha, beta = damping[0], damping[1]
     q, f = work[2, : u.shape[0]], work[3, : u.shape[0]]
-    force = np.zeros(3)
-    done = 0.0
+    force, last = np.zeros(3), np.zeros((2, 3))
+    done = start_of_work(spring, u, last)
     q[:] = u
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
@@ -46,13 +46,15 @@ def euler_steps(
         internal_force(operands, q, f, 1)
         if spring.mode != 0:
             subtract_spring(spring, step / total, q, f, force)
-            done -= spring_work(spring, force, u)
+            done += spring_work(spring, force, u, last)
         for s in range(spans.shape[0]):
             for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
                 w = v[i]
                 v[i] += dt * (-f[i] * inverse_mass[i] - alpha * w)
                 u[i] += dt * w
-        done += spring_work(spring, force, u)
+    if spring.mode != 0:
+        subtract_spring(spring, (first + steps) / total, u, f, force)
+        done += spring_work(spring, force, u, last)
     return done
 
 
@@ -66,8 +68,8 @@ def symplectic_euler_steps(
     """
     alpha, beta = damping[0], damping[1]
     q, f = work[2, : u.shape[0]], work[3, : u.shape[0]]
-    force = np.zeros(3)
-    done = 0.0
+    force, last = np.zeros(3), np.zeros((2, 3))
+    done = start_of_work(spring, u, last)
     q[:] = u
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
@@ -76,12 +78,14 @@ def symplectic_euler_steps(
         internal_force(operands, q, f, 1)
         if spring.mode != 0:
             subtract_spring(spring, step / total, u, f, force)
-            done -= spring_work(spring, force, u)
+            done += spring_work(spring, force, u, last)
         for s in range(spans.shape[0]):
             for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
                 v[i] += dt * (-f[i] * inverse_mass[i] - alpha * v[i])
                 u[i] += dt * v[i]
-        done += spring_work(spring, force, u)
+    if spring.mode != 0:
+        subtract_spring(spring, (first + steps) / total, u, f, force)
+        done += spring_work(spring, force, u, last)
     return done
 
 
@@ -96,8 +100,8 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
     size = u.shape[0]
     us, vs, q = work[0, :size], work[1, :size], work[2, :size]
     f, du, dv = work[3, :size], work[4, :size], work[5, :size]
-    force, middle = np.zeros(3), np.zeros(3)
-    done = 0.0
+    force, last = np.zeros(3), np.zeros((2, 3))
+    done = start_of_work(spring, u, last)
     us[:] = u
     vs[:] = v
     q[:] = u
@@ -116,9 +120,8 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
             if spring.mode != 0:
                 at = (step + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / total
                 subtract_spring(spring, at, us, f, force)
-                if stage == 1:
-                    done -= spring_work(spring, force, u)
-                    middle[:] = force
+                if stage == 0:
+                    done += spring_work(spring, force, u, last)
             share = dt / 6.0 if stage == 0 or stage == 3 else dt / 3.0
             ahead = dt if stage == 2 else 0.5 * dt
             for s in range(spans.shape[0]):
@@ -133,6 +136,7 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
             for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
                 u[i] += du[i]
                 v[i] += dv[i]
-        if spring.mode != 0:
-            done += spring_work(spring, middle, u)
+    if spring.mode != 0:
+        subtract_spring(spring, (first + steps) / total, u, f, force)
+        done += spring_work(spring, force, u, last)
     return done

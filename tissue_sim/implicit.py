@@ -13,7 +13,14 @@ end of the step as well.
 import numpy as np
 from numba import njit
 
-from tissue_sim.coupling import HOLD, PUSH, spring_force, spring_stretch, spring_work
+from tissue_sim.coupling import (
+    HOLD,
+    PUSH,
+    spring_force,
+    spring_stretch,
+    spring_work,
+    start_of_work,
+)
 from tissue_sim.elasticity import internal_force, stiffness_product
 
 _SECANTS = 6
@@ -102,6 +109,8 @@ def _solve(
         for s in range(spans.shape[0]):
             for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
                 curvature += p[i] * q[i]
+        if not curvature > 0.0:
+            return iteration
         step = rho / curvature
         after = 0.0
         for s in range(spans.shape[0]):
@@ -139,7 +148,8 @@ def implicit_steps(
     p, q, f, inverse = work[3, :size], work[4, :size], work[5, :size], work[6, :size]
     factors = np.array([1.0 + dt * alpha, dt * dt + dt * beta, dt * dt])
     stretch, force, matrix = np.empty(3), np.zeros(3), np.zeros((3, 3))
-    done = 0.0
+    last = np.zeros((2, 3))
+    done = start_of_work(spring, u, last)
     for s in range(spans.shape[0]):
         for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
             free = inverse_mass[i] > 0.0
@@ -191,7 +201,8 @@ def implicit_steps(
                 q[i] = u[i] + dt * x[i]
             spring_stretch(spring, at, q, stretch)
             spring_force(spring.mode, stretch, spring.normal, spring.scalars, force)
-            done += spring_work(spring, force, q) - spring_work(spring, force, u)
+            last[0] = force
+            done += spring_work(spring, force, q, last)
         for s in range(spans.shape[0]):
             for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
                 v[i] = x[i]

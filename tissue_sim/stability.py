@@ -172,4 +172,4 @@ def step_bound(integrator: IntegratorName, omega: float, alpha: float, beta: flo
             stable = dt
         else:
             unstable = dt
-    return stable if stable > 1e-6 / omega else 0.0
+    return stable if stable > 1e-5 / omega else 0.0

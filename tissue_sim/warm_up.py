@@ -4,8 +4,13 @@ from itertools import permutations
 
 import numpy as np
 
+from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
 from tissue_sim.contact import State, ToolContact
+from tissue_sim.coupling import Coupling
+from tissue_sim.dynamics import Dynamics, TimeStepping
+from tissue_sim.elasticity import MODELS
+from tissue_sim.integrators import INTEGRATORS
 from tissue_sim.locate import distance_to_triangles, locate_points
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, TopologyDelta
@@ -15,7 +20,8 @@ _FRAMES = 40
 
 
 def warm_up() -> None:
-    """Presses a tool on a cube until the blade is in and through, and takes an element out."""
+    """Every model and integrator; a tool on a cube until the blade is through; an element out."""
+    _warm_up_models()
     simulation = TissueSimulation(
         small_cube(), Material(1000.0, 0.4, 1000.0, 10.0, 5e-4), Resistance(0.05, 1.0, 0.1)
     )
@@ -51,6 +57,15 @@ def warm_up() -> None:
         np.empty(1, np.int64),
         np.empty((1, 4)),
     )
+
+
+def _warm_up_models() -> None:
+    material = Material(1000.0, 0.4, 1000.0, 10.0, 5e-4)
+    region = ActiveSettings('budget', 6)
+    for model in MODELS:
+        Dynamics(small_cube(), material, model, active=region).advance(Coupling())
+    for integrator in INTEGRATORS:
+        Dynamics(small_cube(), material, 'linear', TimeStepping(integrator)).advance(Coupling())
 
 
 def small_cube() -> TetMesh:

@@ -1,0 +1,84 @@
+"""Nodes that nothing moves are not integrated, and that costs little of the answer."""
+
+import numpy as np
+import pytest
+from meshes import box
+
+from tissue_sim.active_region import ActiveSettings
+from tissue_sim.coupling import PUSH, Coupling
+from tissue_sim.dynamics import Dynamics, TimeStepping
+from tissue_sim.elasticity import ModelName
+from tissue_sim.integrators import IntegratorName
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh, TopologyDelta
+
+CELLS, SIZE = (16, 6, 3), 0.01
+
+
+def palpated(
+    settings: ActiveSettings, model: ModelName = 'linear', integrator: IntegratorName = 'rk4'
+) -> tuple[np.ndarray, np.ndarray, Dynamics]:
+    """Displacement by frame and nodes awake, as a slab is pressed near an end and let go."""
+    nodes, tets = box(CELLS, SIZE)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    stepping = TimeStepping(integrator, min_substeps=4 if integrator == 'implicit' else 1)
+    material = Material(5000.0, 0.4, 1000.0, 20.0, 2e-3)
+    dynamics = Dynamics(mesh, material, model, stepping, settings)
+    top = np.argsort(np.linalg.norm(nodes - [0.03, 0.03, 0.03], axis=1))[:1]
+    shapes, awake = [], []
+    for k in range(40):
+        depth = 0.004 * min(k / 8, 1.0)
+        here, before = (nodes[top[0]] - [0, 0, d] for d in (depth, max(depth - 5e-4, 0)))
+        pressing = Coupling(PUSH, top, np.ones(1), before, here, stiffness=200.0)
+        motion = dynamics.advance(pressing if k < 28 else Coupling())
+        assert not motion.trouble
+        shapes.append(dynamics.displacement.copy())
+        awake.append(dynamics.active_nodes)
+    return np.array(shapes), np.array(awake), dynamics
+
+
+@pytest.mark.parametrize(
+    ('model', 'integrator'),
+    [('linear', 'rk4'), ('corotational_smoothed', 'symplectic_euler'), ('linear', 'implicit')],
+)
+def test_a_held_tissue_sleeps_and_differs_little_from_one_that_moves_as_a_whole(
+    model: ModelName, integrator: IntegratorName
+) -> None:
+    whole, everything, _ = palpated(ActiveSettings(), model, integrator)
+    some, awake, dynamics = palpated(ActiveSettings('on'), model, integrator)
+    assert (everything == dynamics.mesh.node_count).all()
+    assert awake[27] < 0.5 * dynamics.mesh.node_count
+    size = np.abs(whole).max()
+    assert np.abs(some[:28] - whole[:28]).max() < 0.01 * size
+    assert np.abs(some - whole).max() < 0.05 * size
+    assert np.abs(some[-1]).max() < 0.01 * size
+
+
+def test_a_smaller_tolerance_errs_less() -> None:
+    whole, _, _ = palpated(ActiveSettings())
+    errors = [
+        np.abs(palpated(ActiveSettings('on', tolerance=t))[0][:28] - whole[:28]).max()
+        for t in (1e-2, 1e-3, 1e-5)
+    ]
+    assert errors[2] < errors[1] < errors[0]
+
+
+def test_a_budget_holds_all_but_the_nodes_nearest_to_the_tool() -> None:
+    shapes, awake, dynamics = palpated(ActiveSettings('budget', nodes=100))
+    assert awake.max() <= 100
+    moved = np.abs(shapes[20]).max(axis=1) > 0
+    distance = np.linalg.norm(dynamics.mesh.rest - [0.03, 0.03, 0.03], axis=1)
+    assert distance[moved].max() <= np.sort(distance)[120]
+
+
+def test_a_cut_wakes_what_it_touched_and_the_same_frames_give_the_same_bits() -> None:
+    ends = []
+    for _ in range(2):
+        _, _, dynamics = palpated(ActiveSettings('on'))
+        dynamics.displacement[:, 0] += 1e-5 * dynamics.mesh.rest[:, 2]
+        dynamics.restart()
+        dynamics.apply_cut(TopologyDelta(removed_tetrahedra=np.array([100, 101])))
+        dynamics.advance(Coupling())
+        assert dynamics.active_nodes > 0
+        ends.append(dynamics.displacement.tobytes())
+    assert ends[0] == ends[1]
