@@ -52,7 +52,7 @@ def vibrate(integrator: IntegratorName, steps: int, seconds: float) -> float:
 
 @pytest.mark.parametrize(
     ('integrator', 'order', 'steps'),
-    [('euler', 1, 800), ('symplectic_euler', 1, 400), ('rk4', 4, 100), ('implicit', 1, 400)],
+    [('euler', 1, 400), ('symplectic_euler', 1, 200), ('rk4', 4, 60), ('implicit', 1, 200)],
 )
 def test_error_falls_with_the_order_of_the_integrator(
     integrator: IntegratorName, order: int, steps: int
@@ -113,7 +113,7 @@ def test_step_bounds_are_those_of_textbooks() -> None:
 
 
 def grown_by(integrator: IntegratorName, name: ModelName, nu: float, share: float) -> float:
-    """Energy after 10^4 steps over that at the start, at a share of the limit for the mesh."""
+    """Energy after many steps over that at the start, at a share of the limit for the mesh."""
     mesh, material = small_block(nu)
     model = ElasticModel(mesh, material, name)
     inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1 / model.mass), 3)
@@ -127,7 +127,7 @@ def grown_by(integrator: IntegratorName, name: ModelName, nu: float, share: floa
     stepper = Integrator(integrator, material.alpha, material.beta)
     nothing = Coupling().spring(mesh.rest)
     with np.errstate(all='ignore'):
-        for _ in range(10):
+        for _ in range(10 if integrator != 'implicit' else 1):
             stepper.step(model.operands(), inverse, model.diagonal, nothing, u, v, dt, 1000)
             if not np.abs(u).max() < 1.0:
                 return np.inf
@@ -140,6 +140,7 @@ def grown_by(integrator: IntegratorName, name: ModelName, nu: float, share: floa
 def test_ten_thousand_steps_just_below_the_limit_decay_and_just_above_it_grow(
     integrator: IntegratorName, name: ModelName, nu: float
 ) -> None:
+    """The implicit one has no limit: a thousand steps of a frame each."""
     assert grown_by(integrator, name, nu, 0.99) < 0.1
     if integrator != 'implicit':
         assert grown_by(integrator, name, nu, 1.03) > 10.0

@@ -220,7 +220,7 @@ def test_the_cantilever_converges_between_first_and_second_order() -> None:
     assert 1.0 < np.log2(errors[0] / errors[1]) < 2.0
 
 
-@pytest.mark.parametrize(('name', 'error'), [('linear', 0.4), ('linear_smoothed', 0.04)])
+@pytest.mark.parametrize(('name', 'error'), [('linear', 0.6), ('linear_smoothed', 0.04)])
 def test_the_first_bending_frequency_of_a_cantilever(name: ModelName, error: float) -> None:
     """Against a slender beam, 8 times as long as deep: Timoshenko's is slower by one per cent."""
     length, depth, modulus, density = 0.12, 0.015, 5000.0, 1000.0

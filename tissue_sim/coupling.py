@@ -138,19 +138,29 @@ def spring_stretch(spring, at, u, stretch):
 
 
 @njit(cache=True)
-def subtract_spring(spring, at, u, f, out):
-    """Takes the spring's force on the tissue off the elastic one.
+def force_of_spring(spring, at, u, out):
+    """Force of the spring on the tissue.
 
     Args:
         spring: see `Spring`.
         at: share of the frame that has passed.
         u: displacement by coordinate [m], shape (3 n,).
-        f: what is to be subtracted from [N], shape (3 n,).
-        out: the spring's force [N], shape (3,).
+        out: [N], shape (3,).
     """
     stretch = np.empty(3)
     spring_stretch(spring, at, u, stretch)
     spring_force(spring.mode, stretch, spring.normal, spring.scalars, out)
+
+
+@njit(cache=True)
+def subtract_spring(spring, at, u, f, out):
+    """Takes the spring's force on the tissue off the elastic one.
+
+    Args:
+        f: what is to be subtracted from [N], shape (3 n,).
+        spring, at, u, out: as for `force_of_spring`.
+    """
+    force_of_spring(spring, at, u, out)
     for c in range(spring.nodes.shape[0]):
         for i in range(3):
             f[3 * spring.nodes[c] + i] -= spring.weights[c] * out[i]

@@ -7,7 +7,7 @@ signature, that of `euler_steps`.
 import numpy as np
 from numba import njit
 
-from tissue_sim.coupling import spring_work, start_of_work, subtract_spring
+from tissue_sim.coupling import force_of_spring, spring_work, start_of_work, subtract_spring
 from tissue_sim.elasticity import internal_force
 
 
@@ -46,6 +46,8 @@ def euler_steps(
         internal_force(operands, q, f, 1)
         if spring.mode != 0:
             subtract_spring(spring, step / total, q, f, force)
+            # Of the spring alone: what its damping takes away, the tissue has not been given.
+            force_of_spring(spring, step / total, u, force)
             done += spring_work(spring, force, u, last)
         for s in range(spans.shape[0]):
             for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
@@ -53,7 +55,7 @@ def euler_steps(
                 v[i] += dt * (-f[i] * inverse_mass[i] - alpha * w)
                 u[i] += dt * w
     if spring.mode != 0:
-        subtract_spring(spring, (first + steps) / total, u, f, force)
+        force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
     return done
 
@@ -84,7 +86,7 @@ def symplectic_euler_steps(
                 v[i] += dt * (-f[i] * inverse_mass[i] - alpha * v[i])
                 u[i] += dt * v[i]
     if spring.mode != 0:
-        subtract_spring(spring, (first + steps) / total, u, f, force)
+        force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
     return done
 
@@ -137,6 +139,6 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
                 u[i] += du[i]
                 v[i] += dv[i]
     if spring.mode != 0:
-        subtract_spring(spring, (first + steps) / total, u, f, force)
+        force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
     return done
