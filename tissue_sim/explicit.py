@@ -10,6 +10,31 @@ from numba import njit
 from tissue_sim.coupling import force_of_spring, spring_work, start_of_work, subtract_spring
 from tissue_sim.elasticity import internal_force
 
+# Of slices, that begin at 0: an index that might be negative keeps loops off vector registers.
+
+
+@njit(cache=True, error_model='numpy')
+def _ahead(q, u, v, beta):
+    for i in range(q.shape[0]):
+        q[i] = u[i] + beta * v[i]
+
+
+@njit(cache=True, error_model='numpy')
+def _accelerate(v, f, inverse_mass, alpha, dt):
+    for i in range(v.shape[0]):
+        v[i] += dt * (-f[i] * inverse_mass[i] - alpha * v[i])
+
+
+@njit(cache=True, error_model='numpy')
+def _stage(f, inverse_mass, u, v, us, vs, du, dv, alpha, share, ahead):
+    for i in range(f.shape[0]):
+        a = -f[i] * inverse_mass[i] - alpha * vs[i]
+        w = vs[i]
+        du[i] += share * w
+        dv[i] += share * a
+        us[i] = u[i] + ahead * w
+        vs[i] = v[i] + ahead * a
+
 
 @njit(cache=True, error_model='numpy')
 def euler_steps(
@@ -41,8 +66,8 @@ def euler_steps(
     q[:] = u
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
-            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                q[i] = u[i] + beta * v[i]
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            _ahead(q[a:b], u[a:b], v[a:b], beta)
         internal_force(operands, q, f, 1)
         if spring.mode != 0:
             subtract_spring(spring, step / total, q, f, force)
@@ -50,10 +75,9 @@ def euler_steps(
             force_of_spring(spring, step / total, u, force)
             done += spring_work(spring, force, u, last)
         for s in range(spans.shape[0]):
-            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                w = v[i]
-                v[i] += dt * (-f[i] * inverse_mass[i] - alpha * w)
-                u[i] += dt * w
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            u[a:b] += dt * v[a:b]
+            _accelerate(v[a:b], f[a:b], inverse_mass[a:b], alpha, dt)
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
@@ -75,16 +99,16 @@ def symplectic_euler_steps(
     q[:] = u
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
-            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                q[i] = u[i] + beta * v[i]
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            _ahead(q[a:b], u[a:b], v[a:b], beta)
         internal_force(operands, q, f, 1)
         if spring.mode != 0:
             subtract_spring(spring, step / total, u, f, force)
             done += spring_work(spring, force, u, last)
         for s in range(spans.shape[0]):
-            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                v[i] += dt * (-f[i] * inverse_mass[i] - alpha * v[i])
-                u[i] += dt * v[i]
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            _accelerate(v[a:b], f[a:b], inverse_mass[a:b], alpha, dt)
+            u[a:b] += dt * v[a:b]
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
@@ -109,15 +133,15 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
     q[:] = u
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
-            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                us[i] = u[i]
-                vs[i] = v[i]
-                du[i] = 0.0
-                dv[i] = 0.0
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            us[a:b] = u[a:b]
+            vs[a:b] = v[a:b]
+            du[a:b] = 0.0
+            dv[a:b] = 0.0
         for stage in range(4):
             for s in range(spans.shape[0]):
-                for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                    q[i] = us[i] + beta * vs[i]
+                a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+                _ahead(q[a:b], us[a:b], vs[a:b], beta)
             internal_force(operands, q, f, 1)
             if spring.mode != 0:
                 at = (step + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / total
@@ -127,17 +151,15 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
             share = dt / 6.0 if stage == 0 or stage == 3 else dt / 3.0
             ahead = dt if stage == 2 else 0.5 * dt
             for s in range(spans.shape[0]):
-                for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                    a = -f[i] * inverse_mass[i] - alpha * vs[i]
-                    w = vs[i]
-                    du[i] += share * w
-                    dv[i] += share * a
-                    us[i] = u[i] + ahead * w
-                    vs[i] = v[i] + ahead * a
+                a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+                _stage(
+                    f[a:b], inverse_mass[a:b], u[a:b], v[a:b], us[a:b], vs[a:b], du[a:b], dv[a:b],
+                    alpha, share, ahead,
+                )  # fmt: skip
         for s in range(spans.shape[0]):
-            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
-                u[i] += du[i]
-                v[i] += dv[i]
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            u[a:b] += du[a:b]
+            v[a:b] += dv[a:b]
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
