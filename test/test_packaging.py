@@ -39,6 +39,7 @@ NOT_FROM_PYPI = {
     'rosidl_parser',
     'rosidl_pycommon',
     'rosidl_runtime_py',
+    'sensor_msgs',
     'std_msgs',
     'std_srvs',
 }
