@@ -48,7 +48,8 @@ class ArmNode(Node):
         seconds: [s] duration of the script; 0: as in the scene.
         seed: of the tremor.
         auto_enable: start in the state ENABLED.
-        wait_for_bridge: begin the script when the bridge is ENABLED and commands; else at once.
+        wait_for_bridge: begin the script when the bridge is ENABLED and commands; else when the
+            arm itself is ENABLED.
 
     It speaks as the scene's section `device` says (unit, mirrored axis, sign, force frame), so that
     a bridge with the same scene understands it.
@@ -120,11 +121,10 @@ class ArmNode(Node):
     def _tick(self, _late_ns: int) -> None:
         arm, now = self._arm, time.monotonic_ns()
         self._take_command(now)
-        if not self._waits or (self._bridge_enabled and arm.commanded):
-            arm.script_running = True
+        enabled = self._machine.state is State.ENABLED
+        arm.script_running |= self._bridge_enabled and arm.commanded if self._waits else enabled
         passed = 1 + self._loop.missed - self._missed
         self._missed = self._loop.missed
-        enabled = self._machine.state is State.ENABLED
         arm.advance(now, enabled=enabled, steps=min(passed, _LONGEST_CATCH_UP))
         self._publish(time.time_ns())
         self._states.publish_changes()
