@@ -34,7 +34,7 @@ from tissue_sim.ros import (
     take_numbered,
 )
 from tissue_sim.scene_file import read_section
-from tissue_sim.timing import PeriodicLoop
+from tissue_sim.timing import Durations, PeriodicLoop
 
 _LONGEST_CATCH_UP = 50
 _NO_TORQUE = (0.0, 0.0, 0.0)
@@ -81,6 +81,7 @@ class ArmNode(Node):
         if self.declare_parameter('auto_enable', True).value:
             self._machine.command('enable')
         self._loop = PeriodicLoop(settings.rate)
+        self._force_age = Durations('force_age')
         self._missed = 0
         self._bridge_enabled = False
         self._done = False
@@ -143,6 +144,7 @@ class ArmNode(Node):
             self._arm.reject()
             self.get_logger().error(str(error), throttle_duration_sec=1.0)
             return
+        self._force_age.add(time.time_ns() - stamp)
         # Its stamps are the bridge's affair: the watchdog goes by arrivals.
         problem = self._watch.see(taken[1], 0, now)
         if problem and self._machine.state is State.ENABLED:
@@ -172,17 +174,21 @@ class ArmNode(Node):
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         arm, machine = self._arm, self._machine
         name, kind = self._script.phase_at(arm.script_time)
-        values = self._loop.report() | {
-            'state': machine.state,
-            'real_time': self._real_time,
-            'watchdog_trips': arm.watchdog_trips,
-            'rejected': arm.rejected,
-            'force_norm': math.hypot(*arm.force.tolist()),
-            'phase': name,
-            'phase_kind': kind,
-            'script_time': arm.script_time,
-            'script_seconds': self._script.seconds,
-        }
+        values = (
+            self._loop.report()
+            | self._force_age.report()
+            | {
+                'state': machine.state,
+                'real_time': self._real_time,
+                'watchdog_trips': arm.watchdog_trips,
+                'rejected': arm.rejected,
+                'force_norm': math.hypot(*arm.force.tolist()),
+                'phase': name,
+                'phase_kind': kind,
+                'script_time': arm.script_time,
+                'script_seconds': self._script.seconds,
+            }
+        )
         if arm.watchdog_trips and not arm.commanded:
             return DiagnosticStatus.WARN, 'servo_cf has stopped: no force on the hand', values
         return DiagnosticStatus.OK, machine.reason or str(machine.state), values

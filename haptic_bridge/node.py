@@ -32,7 +32,7 @@ from haptic_bridge.wire import (
 from tissue_sim import ros
 from tissue_sim.replica import MeshReplica
 from tissue_sim.scene_file import read_section
-from tissue_sim.timing import PeriodicLoop
+from tissue_sim.timing import Durations, PeriodicLoop
 
 FOLLOW_PERIOD = 0.0015
 """[s] between two looks for frames of the simulation."""
@@ -166,6 +166,7 @@ class HapticBridge(Node):
         self._convention = DeviceConvention(device)
         self._watch = StreamWatch(f'{ros.ARM}/measured_cp')
         self._loop = PeriodicLoop(haptics.rate)
+        self._latency = Durations('pose_to_force')
         self._real_time = 'the force loop has not started'
         self._faults, self._last_fault, self._was_faulty = 0, '', False
         self._pose_codec = PoseStampedCodec()
@@ -215,6 +216,8 @@ class HapticBridge(Node):
                 surface=self._follower.surface,
             )
             self._send(tick.wrench, now)
+            if pose is not None:
+                self._latency.add(time.time_ns() - pose.stamp_ns)
             if tick.fault:
                 self._machine.fault(tick.fault)
             contact = self._contact_codec.encode(tick.contact_stamp_ns, tick.contact)
@@ -286,6 +289,7 @@ class HapticBridge(Node):
             'tick_us_p50': report.get('busy_p50', 0.0) * 1e6,
             'tick_us_p99': report.get('busy_p99', 0.0) * 1e6,
             'real_time': self._real_time,
+            **self._latency.report(),
             **report,
         }
         if machine.state is State.FAULT:

@@ -152,6 +152,27 @@ def probe_device(
     raise typer.Exit(int(run_probe(options)))
 
 
+@app.command('bench-timing', epilog=EXIT_STATUSES)
+def bench_timing(
+    scene: Annotated[
+        str, typer.Option(help='Name of a scene in config/scenes, or path of a scene file.')
+    ] = 'liver',
+    seconds: Annotated[float, typer.Option(min=5.0, max=3600.0, help='Duration [s].')] = 20.0,
+    domain: Annotated[
+        str,
+        typer.Option(help='ROS domain, or "free" for one of its own (default: ROS_DOMAIN_ID, 0).'),
+    ] = '',
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the figures as JSON on standard output.')
+    ] = False,
+) -> None:
+    """Measure wake-up and pose-to-force latency of a session, beside cyclictest."""
+    from session.bench_timing import run_bench
+    from session.domain import parse_domain
+
+    raise typer.Exit(int(run_bench(scene, seconds, parse_domain(domain), as_json=as_json)))
+
+
 @app.command(
     epilog='Exit status: that of the program.',
     context_settings={'allow_extra_args': True, 'ignore_unknown_options': True},
