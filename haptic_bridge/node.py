@@ -73,6 +73,10 @@ class SimulationFollower:
         self._answers: deque[Mesh] = deque(maxlen=2)
         self._asked = 0.0
 
+    def cause(self, now_ns: int) -> str:
+        """Why the simulation's forces cannot be trusted at this time [ns], '' if they can."""
+        return self._watch.cause(now_ns)
+
     def run(self, stop: ros.Stop) -> None:
         """Follows until `stop` is set."""
         while not stop.is_set():
@@ -201,7 +205,7 @@ class HapticBridge(Node):
 
     def _cause(self) -> str:
         now = time.monotonic_ns()
-        return self._watch.cause(now) or self._path.cause(now)
+        return self._watch.cause(now) or self._follower.cause(now) or self._path.cause(now)
 
     def _tick(self, _late: int) -> None:
         now = time.monotonic_ns()

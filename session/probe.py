@@ -81,7 +81,7 @@ def run_probe(options: ProbeOptions) -> Status:
         SessionError, SettingsError: it cannot be done as asked.
     """
     notes = Console(stderr=True)
-    profile = DeviceSettings(profile=options.profile).load_profile()
+    profile = DeviceSettings.model_construct(profile=options.profile).load_profile()
     with reserved_domain(options.domain) as domain:
         # Here, for the ROS of this process, before its libraries read it.
         os.environ.update(node_environment(domain))
