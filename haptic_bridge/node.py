@@ -273,6 +273,7 @@ class HapticBridge(Node):
         now = time.monotonic_ns()
         path, machine, report = self._path, self._machine, self._loop.report()
         surface = self._follower.surface
+        publishers = self.count_publishers(self._pose.topic_name)
         values: dict[str, object] = {
             'operating_state': machine.state,
             'fault': machine.reason,
@@ -283,6 +284,7 @@ class HapticBridge(Node):
             'force_norm': path.force_norm,
             'max_force': path.max_force,
             'pose_age': path.pose_age(now),
+            'pose_publishers': publishers,
             'simulation_age': path.simulation_age(now),
             'stale_trips': path.stale_trips,
             'rejected': path.rejected,
@@ -300,6 +302,9 @@ class HapticBridge(Node):
             return DiagnosticStatus.ERROR, machine.reason, values
         if machine.state is State.ENABLED and path.is_stale:
             return DiagnosticStatus.WARN, 'the simulation is silent: no force', values
+        if publishers > 1:
+            topic = self._pose.topic_name
+            return DiagnosticStatus.WARN, f'{topic} has {publishers} publishers', values
         return DiagnosticStatus.OK, str(machine.state), values
 
 

@@ -129,6 +129,12 @@ class World:
             assert time.monotonic() < end, f'no {state}: {self.record.states}'
             time.sleep(0.01)
 
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 5.0
+        while not condition():
+            assert time.monotonic() < deadline, 'waited in vain'
+            time.sleep(0.01)
+
     def encoded_pose(self, stamp: int, height: float) -> bytes:
         return self._codecs[0].encode(stamp, (*self.place, height, 0.0, 0.0, 0.0, 1.0))
 

@@ -151,6 +151,8 @@ def play(world: FaultyWorld, record: Record) -> None:
         time.sleep(0.2)
         world.command.publish(world.message(string='enable'))
         time.sleep(0.3)
+        if fault == 'two publishers':
+            world.wait_until(lambda: record.statuses[-1]['pose_publishers'] == '2')
         record.marks[f'{fault} refused'] = record.states[-1][1] == 'FAULT'
         world.lift()
         end(fault)
@@ -240,6 +242,11 @@ def test_messages_that_come_twice_or_in_the_wrong_order_are_not_felt(record, fau
 
 def test_refused_messages_are_counted(record):
     assert float(record.statuses[-1]['rejected']) > 400
+
+
+def test_the_age_of_the_pose_at_the_force_is_told(record):
+    ages = [float(s['pose_to_force_p50']) for s in record.statuses if 'pose_to_force_p50' in s]
+    assert 0 < ages[-1] < 0.2
 
 
 def test_a_surface_that_loses_the_touched_triangle_is_not_felt_any_more(record):

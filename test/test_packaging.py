@@ -313,5 +313,5 @@ def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(tmp_pa
     assert (share / 'cutting_trainer' / 'launch' / 'trainer.launch.py').is_file()
     assert list((share / 'cutting_trainer' / 'config' / 'scenes').glob('*.yaml'))
     programs = tmp_path / 'install' / 'cutting_trainer' / 'lib' / 'cutting_trainer'
-    assert {path.name for path in programs.iterdir()} == {*MODULES, 'trainer'}
+    assert {path.name for path in programs.iterdir()} == {*MODULES, 'omni_adapter', 'trainer'}
     assert all(os.access(path, os.X_OK) for path in programs.iterdir())
