@@ -20,13 +20,13 @@ from tissue_sim import ros
 DOMAIN = 86
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
-device: {profile: emulated}
+device: {profile: dvrk_mtm}
 haptics: {soft_start: 0.1, device_timeout: 0.2}
 """
 """The device's deadline, 20 ms, is for test_bridge_node.py: a machine that is held up is no fault
-here.
+here. The profile is one whose slew limit, 0.2 N in a tick, the force that is felt would exceed.
 """
-PROFILE = DeviceSettings().load_profile()
+PROFILE = DeviceSettings(profile='dvrk_mtm').load_profile()
 HOUR = 3600 * 10**9
 LATE = 50 * 10**6
 STALE, FADE = 0.1, 0.05
