@@ -49,7 +49,7 @@ def test_an_arm_that_is_wrong_in_every_way_is_told_so_in_every_way(capsys):
     )
     status, checks = found(capsys, emulation=wrong, push=True)
     assert status == Status.FAILED
-    assert '200 Hz' in checks['rate']['measured']
+    assert 150 < float(checks['rate']['measured'].split()[0]) < 250
     for name, remedy in {
         'rate': 'raise the rate',
         'unit': 'device.length_unit: mm',
