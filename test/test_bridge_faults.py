@@ -211,7 +211,7 @@ def test_no_force_exceeds_the_limits_and_none_changes_faster_than_it_may(record)
     assert not (faster & ~at_once).any()
     entered = sum(state == 'FAULT' for _, state in record.states)
     assert len(POSES) <= entered < len(POSES) + 4
-    assert (faster & at_once).sum() <= entered
+    assert (faster & at_once).sum() <= entered + 1  # and when it is asked to end
 
 
 @pytest.mark.parametrize('fault', POSES)
