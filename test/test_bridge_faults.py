@@ -17,6 +17,8 @@ from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.wire import PoseStampedCodec
 from tissue_sim import ros
 
+pytestmark = pytest.mark.real_time
+
 DOMAIN = 86
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}

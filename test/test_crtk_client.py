@@ -16,6 +16,8 @@ pytest.importorskip('rclpy')
 
 from session.graph import MODULES, node_environment
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = 89
 SCENE = """

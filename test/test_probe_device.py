@@ -17,6 +17,8 @@ from session.probe import Emulation, ProbeOptions, run_probe
 from session.status import Status
 from tissue_sim.ros import STREAM, polled, take
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
