@@ -21,6 +21,7 @@ from tissue_sim.share import is_checkout, share_folder
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session')
 PUBLISHED_AS = {
+    '_pytest': 'pytest',
     'mpl_toolkits': 'matplotlib',
     'pydantic_core': 'pydantic',
     'ruamel': 'ruamel.yaml',
