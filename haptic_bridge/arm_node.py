@@ -8,17 +8,21 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.node import Node
+from sensor_msgs.msg import Joy
 
 from haptic_bridge.arm import EmulatedArm
 from haptic_bridge.arm_settings import ArmSettings
+from haptic_bridge.convention import DeviceConvention
 from haptic_bridge.crtk import StateInterface
 from haptic_bridge.hand import Hand, compile_script
 from haptic_bridge.operating_state import OperatingStateMachine, State, crtk_types
 from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.settings import DeviceSettings
+from haptic_bridge.stream_watch import StreamWatch
 from haptic_bridge.wire import PoseStampedCodec, TwistStampedCodec, WireError, WrenchStampedCodec
 from tissue_sim.ros import (
     ARM,
+    EVENTS,
     LATCHED,
     NEWEST_BEST_EFFORT,
     STREAM,
@@ -27,10 +31,10 @@ from tissue_sim.ros import (
     announce_ready,
     polled,
     run,
-    take_raw,
+    take_numbered,
 )
 from tissue_sim.scene_file import read_section
-from tissue_sim.timing import PeriodicLoop
+from tissue_sim.timing import Durations, PeriodicLoop
 
 _LONGEST_CATCH_UP = 50
 _NO_TORQUE = (0.0, 0.0, 0.0)
@@ -44,6 +48,11 @@ class ArmNode(Node):
         seconds: [s] duration of the script; 0: as in the scene.
         seed: of the tremor.
         auto_enable: start in the state ENABLED.
+        wait_for_bridge: begin the script when the bridge is ENABLED and commands; else when the
+            arm itself is ENABLED.
+
+    It speaks as the scene's section `device` says (unit, mirrored axis, sign, force frame), so that
+    a bridge with the same scene understands it.
     """
 
     def __init__(self) -> None:
@@ -57,6 +66,8 @@ class ArmNode(Node):
         device = read_section(scene, 'device', DeviceSettings)
         script = compile_script(settings.script, device.tissue_from_device, seconds)
         body_force = device.force_frame == 'body'
+        self._convention = DeviceConvention(device)
+        self._waits = bool(self.declare_parameter('wait_for_bridge', True).value)
 
         def new_arm() -> EmulatedArm:
             hand = Hand(settings.hand, script, seed)
@@ -65,10 +76,12 @@ class ArmNode(Node):
         new_arm().advance(0, enabled=False)  # compiles the kernels before the clock runs
         self._arm = new_arm()
         self._script = script
-        self._machine = OperatingStateMachine()
+        self._watch = StreamWatch(f'{ARM}/servo_cf')
+        self._machine = OperatingStateMachine(lambda: self._watch.cause(time.monotonic_ns()))
         if self.declare_parameter('auto_enable', True).value:
             self._machine.command('enable')
         self._loop = PeriodicLoop(settings.rate)
+        self._force_age = Durations('force_age')
         self._missed = 0
         self._bridge_enabled = False
         self._done = False
@@ -82,6 +95,8 @@ class ArmNode(Node):
         self._measured_cv = self.create_publisher(TwistStamped, f'{ARM}/measured_cv', STREAM)
         self._measured_cf = self.create_publisher(WrenchStamped, f'{ARM}/measured_cf', STREAM)
         self._servo_cf = polled(self, WrenchStamped, f'{ARM}/servo_cf', NEWEST_BEST_EFFORT)
+        self._button = self.create_publisher(Joy, f'{ARM}/button', EVENTS)
+        self._pressed: bool | None = None
         self._states = StateInterface(self, ARM, self._machine)
         self._bridge = self.create_subscription(
             crtk_types().operating_state,
@@ -107,37 +122,51 @@ class ArmNode(Node):
     def _tick(self, _late_ns: int) -> None:
         arm, now = self._arm, time.monotonic_ns()
         self._take_command(now)
-        if not arm.script_running and self._bridge_enabled and arm.commanded:
-            arm.script_running = True
+        enabled = self._machine.state is State.ENABLED
+        arm.script_running |= self._bridge_enabled and arm.commanded if self._waits else enabled
         passed = 1 + self._loop.missed - self._missed
         self._missed = self._loop.missed
-        enabled = self._machine.state is State.ENABLED
         arm.advance(now, enabled=enabled, steps=min(passed, _LONGEST_CATCH_UP))
         self._publish(time.time_ns())
         self._states.publish_changes()
+        self._press(self._script.button_at(arm.script_time))
         if arm.script_over and not self._done:
             self._done = True
             print(f'done: {self.get_name()}', flush=True)
 
     def _take_command(self, now: int) -> None:
-        data = take_raw(self._servo_cf)
-        if data is None:
+        taken = take_numbered(self._servo_cf)
+        if taken is None:
             return
         try:
-            stamp, _, values = self._cf.decode(data)
+            stamp, _, values = self._cf.decode(taken[0])
         except WireError as error:
             self._arm.reject()
             self.get_logger().error(str(error), throttle_duration_sec=1.0)
-        else:
-            self._arm.command(stamp, values[:3], now)
+            return
+        self._force_age.add(time.time_ns() - stamp)
+        # Its stamps are the bridge's affair: the watchdog goes by arrivals.
+        problem = self._watch.see(taken[1], 0, now)
+        if problem and self._machine.state is State.ENABLED:
+            self._machine.fault(problem)
+        self._arm.command(stamp, self._convention.force(values)[:3], now)
+
+    def _press(self, pressed: bool) -> None:
+        """Publishes the button on event, as CRTK has it: 1 pressed, 0 released."""
+        if pressed is not self._pressed:
+            self._pressed = pressed
+            message = Joy(buttons=[int(pressed)])
+            message.header.stamp = self.get_clock().now().to_msg()
+            self._button.publish(message)
 
     def _publish(self, stamp: int) -> None:
-        arm = self._arm
-        pose = (*arm.position.tolist(), *arm.orientation.tolist())
-        twist = (*arm.velocity.tolist(), *arm.angular_velocity.tolist())
+        arm, spoken = self._arm, self._convention
+        pose = spoken.spoken_pose((*arm.position.tolist(), *arm.orientation.tolist()))
+        twist = spoken.spoken_twist((*arm.velocity.tolist(), *arm.angular_velocity.tolist()))
+        wrench = spoken.force((*arm.force.tolist(), *_NO_TORQUE))
         self._measured_cp.publish(self._cp.encode(stamp, pose))
         self._measured_cv.publish(self._cv.encode(stamp, twist))
-        self._measured_cf.publish(self._cf.encode(stamp, (*arm.force.tolist(), *_NO_TORQUE)))
+        self._measured_cf.publish(self._cf.encode(stamp, wrench))
 
     def _bridge_state(self, message: Any) -> None:
         self._bridge_enabled = message.state == State.ENABLED
@@ -145,17 +174,21 @@ class ArmNode(Node):
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         arm, machine = self._arm, self._machine
         name, kind = self._script.phase_at(arm.script_time)
-        values = self._loop.report() | {
-            'state': machine.state,
-            'real_time': self._real_time,
-            'watchdog_trips': arm.watchdog_trips,
-            'rejected': arm.rejected,
-            'force_norm': math.hypot(*arm.force.tolist()),
-            'phase': name,
-            'phase_kind': kind,
-            'script_time': arm.script_time,
-            'script_seconds': self._script.seconds,
-        }
+        values = (
+            self._loop.report()
+            | self._force_age.report()
+            | {
+                'state': machine.state,
+                'real_time': self._real_time,
+                'watchdog_trips': arm.watchdog_trips,
+                'rejected': arm.rejected,
+                'force_norm': math.hypot(*arm.force.tolist()),
+                'phase': name,
+                'phase_kind': kind,
+                'script_time': arm.script_time,
+                'script_seconds': self._script.seconds,
+            }
+        )
         if arm.watchdog_trips and not arm.commanded:
             return DiagnosticStatus.WARN, 'servo_cf has stopped: no force on the hand', values
         return DiagnosticStatus.OK, machine.reason or str(machine.state), values

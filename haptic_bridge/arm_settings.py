@@ -44,6 +44,7 @@ class Phase(SceneModel):
     )
     name: str = Field('', description='for messages; empty: the kind')
     share: float = Field(1.0, gt=0, le=1000, description='duration, in shares of the script')
+    button: bool = Field(False, description='whether the hand presses the button of the arm')
     repeat: int = Field(1, ge=1, le=1000, description='rounds through the waypoints')
     waypoints: tuple[Waypoint, ...] = Field((), description='none: the hand stays')
 

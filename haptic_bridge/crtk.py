@@ -1,10 +1,11 @@
-"""CRTK's operating state over ROS: topic, commands and query of one device or bridge."""
+"""CRTK over ROS: the operating state's topic, commands and query, and a button to hold."""
 
 from typing import Any
 
 from rclpy.node import Node
+from sensor_msgs.msg import Joy
 
-from haptic_bridge.operating_state import OperatingStateMachine, crtk_types
+from haptic_bridge.operating_state import OperatingStateMachine, State, crtk_types
 from tissue_sim.ros import EVENTS, LATCHED
 
 
@@ -57,3 +58,35 @@ class StateInterface:
         )
         message.header.stamp = self._node.get_clock().now().to_msg()
         return message
+
+
+class HoldButton:
+    """A dead man's switch: PAUSED while `<name>/button` (sensor_msgs/Joy) is not pressed.
+
+    Pressing resumes what letting go has paused, and nothing else: a `pause` by command stays.
+
+    Args:
+        node: to subscribe with.
+        name: namespace of the device.
+        machine: of the bridge.
+    """
+
+    def __init__(self, node: Node, name: str, machine: OperatingStateMachine) -> None:
+        self._machine = machine
+        self._pressed = self._paused = False
+        self._presses = node.create_subscription(Joy, f'{name}/button', self._event, EVENTS)
+
+    def _event(self, message: Joy) -> None:
+        self._pressed = bool(message.buttons) and message.buttons[0] == 1
+        self.enforce()
+
+    def enforce(self) -> None:
+        """Makes the state what the button asks for; call often."""
+        if self._machine.state is not State.PAUSED:
+            self._paused = False
+        if not self._pressed and self._machine.state is State.ENABLED:
+            self._machine.command('pause')
+            self._paused = True
+        elif self._pressed and self._paused:
+            self._machine.command('resume')
+            self._paused = False

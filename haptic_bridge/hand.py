@@ -26,6 +26,7 @@ class HandScript:
         orientations: quaternions x y z w, signs continuous, shape (n, 4).
         phase_ends: [s] by phase, shape (p,).
         phases: name and kind by phase.
+        buttons: whether the button is pressed, by phase.
     """
 
     times: np.ndarray
@@ -33,6 +34,7 @@ class HandScript:
     orientations: np.ndarray
     phase_ends: np.ndarray
     phases: tuple[tuple[str, str], ...]
+    buttons: tuple[bool, ...]
 
     @property
     def seconds(self) -> float:
@@ -41,8 +43,15 @@ class HandScript:
 
     def phase_at(self, time: float) -> tuple[str, str]:
         """Name and kind of the phase at a time [s]; the last one after the end."""
+        return self.phases[self._index_at(time)]
+
+    def button_at(self, time: float) -> bool:
+        """Whether the button is pressed at a time [s]."""
+        return self.buttons[self._index_at(time)]
+
+    def _index_at(self, time: float) -> int:
         index = int(np.searchsorted(self.phase_ends, time, side='right'))
-        return self.phases[min(index, len(self.phases) - 1)]
+        return min(index, len(self.phases) - 1)
 
 
 def compile_script(
@@ -75,6 +84,7 @@ def compile_script(
         orientations=_orientations(poses, tissue_from_device),
         phase_ends=np.cumsum(ends),
         phases=tuple((phase.name or phase.kind, phase.kind) for phase in settings.phases),
+        buttons=tuple(phase.button for phase in settings.phases),
     )
 
 

@@ -14,11 +14,13 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from haptic_bridge.crtk import StateInterface
+from haptic_bridge.convention import DeviceConvention
+from haptic_bridge.crtk import HoldButton, StateInterface
 from haptic_bridge.force_path import ForcePath, warm_up
 from haptic_bridge.operating_state import OperatingStateMachine, State
 from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from haptic_bridge.stream_watch import StreamWatch
 from haptic_bridge.surface import Surface
 from haptic_bridge.wire import (
     ContactCodec,
@@ -30,7 +32,7 @@ from haptic_bridge.wire import (
 from tissue_sim import ros
 from tissue_sim.replica import MeshReplica
 from tissue_sim.scene_file import read_section
-from tissue_sim.timing import PeriodicLoop
+from tissue_sim.timing import Durations, PeriodicLoop
 
 FOLLOW_PERIOD = 0.0015
 """[s] between two looks for frames of the simulation."""
@@ -38,6 +40,8 @@ STATE_PERIOD = 0.02
 """[s] between two looks for changes of the operating state."""
 ANSWER_TIMEOUT = 1.0
 """[s] after which a question for the full mesh is asked again."""
+CLOCK_STEP = 1_000_000
+"""[ns] by which the system clock may differ from the stamps before they follow it."""
 
 
 class SimulationFollower:
@@ -61,12 +65,17 @@ class SimulationFollower:
         self._replica = MeshReplica()
         self._stamp = (0, 0)
         self._codec = ForceSampleCodec()
+        self._watch = StreamWatch(ros.FORCE)
         self._mesh = ros.polled(node, Mesh, ros.MESH, ros.LATCHED)
         self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
         self._force = ros.polled(node, ForceSample, ros.FORCE, ros.STREAM)
         self._client = node.create_client(GetMesh, ros.GET_MESH)
         self._answers: deque[Mesh] = deque(maxlen=2)
         self._asked = 0.0
+
+    def cause(self, now_ns: int) -> str:
+        """Why the simulation's forces cannot be trusted at this time [ns], '' if they can."""
+        return self._watch.cause(now_ns)
 
     def run(self, stop: ros.Stop) -> None:
         """Follows until `stop` is set."""
@@ -89,9 +98,13 @@ class SimulationFollower:
             self._apply(delta)
         if (self._replica.revision, self._replica.topology) != known:
             self._renew()
-        raw = ros.take_raw(self._force)
-        if raw is not None:
-            self.samples.append(self._codec.decode(raw))
+        taken = ros.take_numbered(self._force)
+        if taken is not None:
+            sample = self._codec.decode(taken[0])
+            self.samples.append(sample)
+            problem = self._watch.see(taken[1], sample.stamp_ns, time.monotonic_ns())
+            if problem:
+                self._on_error(problem)
 
     def _load(self, mesh: Mesh) -> None:
         # A keyframe can arrive after the deltas that follow it; an older revision of a younger
@@ -153,8 +166,11 @@ class HapticBridge(Node):
         profile = device.load_profile()
         warm_up(tool, device, haptics, profile)
         self._path = ForcePath(tool, device, haptics, profile)
-        self._machine = OperatingStateMachine(lambda: self._path.cause(time.monotonic_ns()))
+        self._machine = OperatingStateMachine(self._cause)
+        self._convention = DeviceConvention(device)
+        self._watch = StreamWatch(f'{ros.ARM}/measured_cp')
         self._loop = PeriodicLoop(haptics.rate)
+        self._latency = Durations('pose_to_force')
         self._real_time = 'the force loop has not started'
         self._faults, self._last_fault, self._was_faulty = 0, '', False
         self._pose_codec = PoseStampedCodec()
@@ -165,6 +181,9 @@ class HapticBridge(Node):
         self._contact = self.create_publisher(Contact, ros.CONTACT, ros.STREAM)
         self._follower = SimulationFollower(self, self._machine.fault)
         self._interface = StateInterface(self, 'haptic_bridge', self._machine)
+        self._button = HoldButton(self, ros.ARM, self._machine) if device.hold_button else None
+        self._epoch = time.time_ns() - time.monotonic_ns()
+        self._stale_trips = 0
         self._diagnostics = ros.Diagnostics(self, self._collect)
         self._states = self.create_timer(STATE_PERIOD, self._watch_state)
 
@@ -180,34 +199,59 @@ class HapticBridge(Node):
 
     def close(self) -> None:
         """Leaves no force behind."""
-        self._send((0.0,) * 6)
+        self._send((0.0,) * 6, time.monotonic_ns())
         self._wrench.wait_for_all_acked(Duration(seconds=0.2))
         self._diagnostics.publish()
 
+    def _cause(self) -> str:
+        now = time.monotonic_ns()
+        return self._watch.cause(now) or self._follower.cause(now) or self._path.cause(now)
+
     def _tick(self, _late: int) -> None:
+        now = time.monotonic_ns()
         try:
-            raw = ros.take_raw(self._pose)
+            pose = self._take_pose(now)
             samples = self._follower.samples
             tick = self._path.tick(
-                time.monotonic_ns(),
+                now,
                 state=self._machine.state,
-                pose=None if raw is None else self._pose_codec.decode(raw),
+                pose=pose,
                 sample=samples.popleft() if samples else None,
                 surface=self._follower.surface,
             )
-            self._send(tick.wrench)
+            self._send(tick.wrench, now)
+            if pose is not None:
+                self._latency.add(time.time_ns() - pose.stamp_ns)
             if tick.fault:
                 self._machine.fault(tick.fault)
             contact = self._contact_codec.encode(tick.contact_stamp_ns, tick.contact)
             self._contact.publish(contact)
         except Exception as error:
             self._machine.fault(f'the force loop failed: {type(error).__name__}: {error}')
-            self._send((0.0,) * 6)
+            self._send((0.0,) * 6, now)
 
-    def _send(self, wrench: tuple[float, ...]) -> None:
-        self._wrench.publish(self._wrench_codec.encode(time.time_ns(), wrench))
+    def _take_pose(self, now: int) -> Sample | None:
+        taken = ros.take_numbered(self._pose)
+        if taken is None:
+            return None
+        sample = self._pose_codec.decode(taken[0])
+        problem = self._watch.see(taken[1], sample.stamp_ns, now)
+        if problem and self._machine.state is State.ENABLED:
+            self._machine.fault(problem)
+        return self._convention.pose(sample)
+
+    def _send(self, wrench: tuple[float, ...], now: int) -> None:
+        """Publishes a force, stamped with the time [ns] for which it was computed."""
+        wrench = self._convention.force(wrench)
+        self._wrench.publish(self._wrench_codec.encode(self._epoch + now, wrench))
 
     def _watch_state(self) -> None:
+        # The largest: where the thread lost its turn between the two readings, it is too small.
+        epoch = max(time.time_ns() - time.monotonic_ns() for _ in range(3))
+        if abs(epoch - self._epoch) > CLOCK_STEP:
+            self._epoch = epoch
+        if self._button is not None:
+            self._button.enforce()
         if self._auto_enable and self._path.is_fresh(time.monotonic_ns()):
             self._auto_enable = False
             self._machine.command('enable')
@@ -216,12 +260,20 @@ class HapticBridge(Node):
             self._faults += 1
             self._last_fault = reason
         self._was_faulty = bool(reason)
+        if self._path.stale_trips != self._stale_trips:
+            self._stale_trips = self._path.stale_trips
+            self.get_logger().warning(
+                f'no frame of the simulation for {self._path.haptics.stale_after * 1e3:g} ms: '
+                'the force fades',
+                throttle_duration_sec=1.0,
+            )
         self._interface.publish_changes()
 
     def _collect(self) -> tuple[bytes, str, dict[str, object]]:
         now = time.monotonic_ns()
         path, machine, report = self._path, self._machine, self._loop.report()
         surface = self._follower.surface
+        publishers = self.count_publishers(self._pose.topic_name)
         values: dict[str, object] = {
             'operating_state': machine.state,
             'fault': machine.reason,
@@ -232,6 +284,7 @@ class HapticBridge(Node):
             'force_norm': path.force_norm,
             'max_force': path.max_force,
             'pose_age': path.pose_age(now),
+            'pose_publishers': publishers,
             'simulation_age': path.simulation_age(now),
             'stale_trips': path.stale_trips,
             'rejected': path.rejected,
@@ -242,12 +295,16 @@ class HapticBridge(Node):
             'tick_us_p50': report.get('busy_p50', 0.0) * 1e6,
             'tick_us_p99': report.get('busy_p99', 0.0) * 1e6,
             'real_time': self._real_time,
+            **self._latency.report(),
             **report,
         }
         if machine.state is State.FAULT:
             return DiagnosticStatus.ERROR, machine.reason, values
         if machine.state is State.ENABLED and path.is_stale:
             return DiagnosticStatus.WARN, 'the simulation is silent: no force', values
+        if publishers > 1:
+            topic = self._pose.topic_name
+            return DiagnosticStatus.WARN, f'{topic} has {publishers} publishers', values
         return DiagnosticStatus.OK, str(machine.state), values
 
 

@@ -1,10 +1,10 @@
 """What a scene says about the tool, the device and the haptics, and what a device can do."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from scipy.spatial.transform import Rotation
@@ -13,6 +13,7 @@ from tissue_sim.scene_file import SceneModel, nearest
 from tissue_sim.share import share_folder
 
 Vector = tuple[float, float, float]
+Edge = Annotated[float, Field(gt=0, le=5)]
 
 
 class SettingsError(ValueError):
@@ -77,29 +78,48 @@ class DeviceSettings(SceneModel):
         'base',
         description='axes of servo_cf: of the device base (as drivers expect) or the tool body',
     )
+    force_sign: Literal[1, -1] = Field(
+        1, description='-1 where the device takes the force on itself, not the one on the hand'
+    )
+    length_unit: Literal['m', 'dm', 'cm', 'mm'] = Field(
+        'm', description='unit of the positions that the device sends'
+    )
+    mirrored_axis: Literal['none', 'x', 'y', 'z'] = Field(
+        'none', description='axis whose sign makes the frame of a left-handed device right-handed'
+    )
+    hold_button: bool = Field(
+        False, description='force only while the button arm/button is pressed; else PAUSED'
+    )
 
     def load_profile(self) -> 'DeviceProfile':
         """Reads the limits of the chosen device."""
         return DeviceProfile.load(share_folder() / 'config' / 'devices' / f'{self.profile}.yaml')
 
 
-class DeviceProfile(BaseModel):
-    """What a device bears. Other keys of its file belong to whoever drives or emulates it."""
+Limit = Literal['max_force', 'max_slew', 'max_stiffness', 'workspace']
 
-    model_config = ConfigDict(extra='ignore', frozen=True, allow_inf_nan=False)
 
+class DeviceProfile(SceneModel):
+    """What a device bears."""
+
+    device: str = Field('', description='name of the device, for messages')
     max_force: float = Field(gt=0, le=100, description='[N] largest norm ever commanded')
     max_slew: float = Field(gt=0, le=100_000, description='[N/s] largest rate of the force')
     max_stiffness: float = Field(
         gt=0, le=50_000, description='[N/m] largest that it renders stably'
     )
+    workspace: tuple[Edge, Edge, Edge] | None = Field(
+        None, description='[m] edges of the box in which the tip can be; without it, unknown'
+    )
+    sources: dict[Limit, str] = Field({}, description='where each figure comes from')
 
     @classmethod
     def load(cls, path: Path) -> 'DeviceProfile':
         """Reads a device file.
 
         Raises:
-            SettingsError: the file is missing or a limit in it is.
+            SettingsError: the file is missing, or something in it is missing, unknown or out of
+                range.
         """
         try:
             content = YAML(typ='safe', pure=True).load(path.read_text(encoding='utf-8'))
@@ -109,8 +129,28 @@ class DeviceProfile(BaseModel):
             near = nearest(path.stem, known)
             hint = f'did you mean {near}?' if near else f'known are {", ".join(known) or "none"}'
             raise SettingsError(f'device.profile: {path} does not exist: {hint}') from None
-        except (ValidationError, YAMLError) as error:
-            raise SettingsError(f'{path}: {error}') from None
+        except ValidationError as error:
+            raise SettingsError(f'{path}: {_first_problem(error, cls)}') from None
+        except YAMLError as error:
+            raise SettingsError(f'{path} is not YAML: {" ".join(str(error).split())}') from None
+
+
+def _first_problem(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first thing that is wrong with a file of one level, as a sentence."""
+    problem = error.errors()[0]
+    if not problem['loc']:
+        return f'the file is {problem["input"]!r}, but a profile is a mapping with max_force first'
+    key, fields = str(problem['loc'][0]), model.model_fields
+    if problem['type'] == 'extra_forbidden':
+        near = nearest(key, fields)
+        return f'{key} is unknown: ' + (
+            f'did you mean {near}?' if near else f'known are {", ".join(fields)}'
+        )
+    meaning = fields[key].description
+    if problem['type'] == 'missing' and len(problem['loc']) == 1:
+        return f'{key} is missing: {meaning}'
+    place = '.'.join(map(str, problem['loc']))
+    return f'{place} is {problem["input"]!r}: {problem["msg"]} ({key}: {meaning})'
 
 
 class HapticsSettings(SceneModel):

@@ -113,6 +113,66 @@ def fuzz_cuts(
     raise typer.Exit(int(replay_scene(replay, method) if replay else run_strokes(*options)))
 
 
+@app.command('probe-device', epilog=EXIT_STATUSES)
+def probe_device(
+    arm: Annotated[
+        str, typer.Option(help='Namespace of the device, as in /MTML for /MTML/measured_cp.')
+    ] = 'arm',
+    profile: Annotated[
+        str, typer.Option(help='Name of a file in config/devices, without .yaml.')
+    ] = 'emulated',
+    emulated: Annotated[
+        bool, typer.Option('--emulated', help='Start the emulated arm and probe that.')
+    ] = False,
+    moves: Annotated[
+        bool, typer.Option(help='Ask for three moves, which tell unit and handedness.')
+    ] = True,
+    push: Annotated[
+        bool,
+        typer.Option(
+            '--push', help='Push the hand with 0.3 N: without it no force is sent at all.'
+        ),
+    ] = False,
+    domain: Annotated[
+        str,
+        typer.Option(help='ROS domain, or "free" for one of its own (default: ROS_DOMAIN_ID, 0).'),
+    ] = '',
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the checks as JSON on standard output.')
+    ] = False,
+) -> None:
+    """Check a connected arm: rate, jitter, stamps, unit, handedness, sign of the force."""
+    from session.domain import parse_domain
+    from session.probe import Emulation, ProbeOptions, run_probe
+
+    emulation = Emulation() if emulated else None
+    options = ProbeOptions(
+        arm, profile, emulation, moves, push, parse_domain(domain), as_json=as_json
+    )
+    raise typer.Exit(int(run_probe(options)))
+
+
+@app.command('bench-timing', epilog=EXIT_STATUSES)
+def bench_timing(
+    scene: Annotated[
+        str, typer.Option(help='Name of a scene in config/scenes, or path of a scene file.')
+    ] = 'liver',
+    seconds: Annotated[float, typer.Option(min=5.0, max=3600.0, help='Duration [s].')] = 20.0,
+    domain: Annotated[
+        str,
+        typer.Option(help='ROS domain, or "free" for one of its own (default: ROS_DOMAIN_ID, 0).'),
+    ] = '',
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the figures as JSON on standard output.')
+    ] = False,
+) -> None:
+    """Measure wake-up and pose-to-force latency of a session, beside cyclictest."""
+    from session.bench_timing import run_bench
+    from session.domain import parse_domain
+
+    raise typer.Exit(int(run_bench(scene, seconds, parse_domain(domain), as_json=as_json)))
+
+
 @app.command(
     epilog='Exit status: that of the program.',
     context_settings={'allow_extra_args': True, 'ignore_unknown_options': True},

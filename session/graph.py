@@ -40,13 +40,10 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
     commands = []
     for name, module in MODULES.items():
         parameters = {'scene': str(scene), 'seed': seed, **own.get(name, {})}
-        # What a node says goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
-        argv = [sys.executable, '-m', module, '--ros-args', '--disable-external-lib-logs']
-        for key, value in parameters.items():
-            argv += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False)}']
+        argv = _argv(module, parameters)
         records = name == RECORDER_NODE
         grace = CLOSING_A_BAG if records else NodeCommand.grace
-        commands.append(NodeCommand(name, tuple(argv), records=records, grace=grace))
+        commands.append(NodeCommand(name, argv, records=records, grace=grace))
     return commands
 
 
@@ -65,6 +62,20 @@ def discovery(environ: Mapping[str, str]) -> dict[str, str]:
     if environ.get(PROFILES, path) != path:
         return {RANGE: given, PROFILES: environ[PROFILES]}
     return {RANGE: 'SYSTEM_DEFAULT' if given == 'LOCALHOST' else given, PROFILES: path}
+
+
+def arm_command(scene: Path, **parameters: object) -> NodeCommand:
+    """The emulated arm alone."""
+    values = {'scene': str(scene), **parameters}
+    return NodeCommand(ARM_NODE, _argv(MODULES[ARM_NODE], values))
+
+
+def _argv(module: str, parameters: dict[str, object]) -> tuple[str, ...]:
+    # What a node says goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
+    argv = [sys.executable, '-m', module, '--ros-args', '--disable-external-lib-logs']
+    for key, value in parameters.items():
+        argv += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False)}']
+    return tuple(argv)
 
 
 def node_environment(domain: int) -> dict[str, str]:

@@ -1,19 +1,25 @@
-"""Tests against the clock (marker `real_time`) are repeated where the machine failed, not the code.
+"""Tests against the clock (marker `real_time`) are repeated where the machine failed, not the code;
+and a fixture that more than one file uses.
 
 Such a test is run again, at most twice, if it failed while a processor demonstrably stood still
 (stand_still.py). A fault of the code fails each time.
 """
 
+import functools
+import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from _pytest.runner import runtestprotocol
 
+STAND_INS = Path(__file__).with_name('stand_ins')
+PYTHON = f'python{sys.version_info.major}.{sys.version_info.minor}'
 ATTEMPTS = 3
 OUTPUT = pytest.StashKey[Path]()
 WATCH = pytest.StashKey['subprocess.Popen[bytes]']()
@@ -71,3 +77,42 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Says what was run more than once."""
     for line in terminalreporter.config.stash[REPEATED]:
         terminalreporter.write_line(f'while the machine stood still: {line}')
+
+
+@pytest.fixture
+def others_messages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Environment in which crtk_msgs and omni_msgs are there, built here once if they are not."""
+    if find_spec('crtk_msgs') and find_spec('omni_msgs'):
+        return dict(os.environ)
+    if shutil.which('colcon') is None:
+        pytest.skip('colcon is not installed: with a sourced Jazzy, apt install ros-dev-tools')
+    prefix = built_stand_ins(tmp_path_factory)
+    added = {
+        'PYTHONPATH': prefix / 'lib' / PYTHON / 'site-packages',
+        'LD_LIBRARY_PATH': prefix / 'lib',
+        'AMENT_PREFIX_PATH': prefix,
+    }
+    return os.environ | {
+        name: os.pathsep.join([str(path), os.environ.get(name, '')]) for name, path in added.items()
+    }
+
+
+@functools.cache
+def built_stand_ins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Builds the packages of test/stand_ins in a temporary workspace; returns its prefix."""
+    workspace = tmp_path_factory.mktemp('stand_ins')
+    clean = {key: value for key, value in os.environ.items() if not key.startswith('PYTHON')}
+    prefixes = clean.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    kept = [p for p in prefixes if not Path(p, 'share', 'cutting_trainer_msgs').exists()]
+    clean['AMENT_PREFIX_PATH'] = clean['CMAKE_PREFIX_PATH'] = os.pathsep.join(kept)
+    quick = ['--cmake-args', '-DCMAKE_C_FLAGS=-O0', '-DCMAKE_CXX_FLAGS=-O0']
+    built = subprocess.run(
+        ['colcon', 'build', '--merge-install', '--base-paths', str(STAND_INS), *quick],
+        cwd=workspace,
+        env=clean,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    return workspace / 'install'

@@ -107,6 +107,7 @@ class Bridge:
         ]
         self.force: tuple[float, ...] | None = None
         self.last_sent = 0
+        self.second: Any = None
         self._codec: StampedCodec = WrenchStampedCodec('arm_base')
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
@@ -137,7 +138,7 @@ class Bridge:
 
     def _run(self) -> None:
         request_real_time(PRIORITY)
-        deadline, before = time.monotonic(), 0
+        deadline, before, ticks = time.monotonic(), 0, 0
         while not self._stop.is_set():
             now = time.time_ns()
             if before:
@@ -145,7 +146,10 @@ class Bridge:
             before = now
             if (force := self.force) is not None:
                 self.last_sent = now
-                self.servo_cf.publish(self._codec.encode(now, (*force, 0.0, 0.0, 0.0)))
+                ticks += 1
+                # In turns, where there is a second one.
+                sender = (ticks % 2 and self.second) or self.servo_cf
+                sender.publish(self._codec.encode(now, (*force, 0.0, 0.0, 0.0)))
             self._listen()
             deadline += 0.001
             time.sleep(max(deadline - time.monotonic(), 0.0))
@@ -184,7 +188,7 @@ def play(bridge: Bridge, record: Record) -> None:
     bridge.force = PUSH
     time.sleep(0.5)
     record.mark('pushed')
-    time.sleep(0.1)
+    time.sleep(1.1)  # one period of the diagnostics
     bridge.silence('silent')
     time.sleep(0.2)
     bridge.force = PUSH
@@ -207,6 +211,14 @@ def play(bridge: Bridge, record: Record) -> None:
     record.mark('disabled')
     bridge.order('disable', 'DISABLED')
     time.sleep(0.1)
+    bridge.order('enable', 'ENABLED')
+    record.mark('two bridges')
+    bridge.second = bridge.node.create_publisher(WrenchStamped, 'arm/servo_cf', ros.STREAM)
+    wait_for(lambda: record.states[-1] == 'FAULT', 5.0)
+    record.mark('two bridges told')
+    time.sleep(0.2)
+    bridge.second = None
+    time.sleep(1.2)
     bridge.order('enable', 'ENABLED')
     record.mark('before garbage')
     time.sleep(0.1)
@@ -335,8 +347,17 @@ def test_there_is_no_force_while_paused_or_disabled_although_commands_arrive(rec
     assert_array_equal(forces, np.broadcast_to(PUSH, forces.shape))
 
 
+def test_two_bridges_that_command_at_once_are_a_fault_without_force(record):
+    forces = record.between(
+        record.wrenches, 'two bridges told', 'before garbage', delay=SCHEDULING
+    )[:1000]
+    assert len(forces) == 1000
+    assert_array_equal(forces, 0)
+
+
 def test_operating_state_is_latched_published_on_event_and_answered(record):
-    assert record.states == ['ENABLED', 'PAUSED', 'ENABLED', 'DISABLED', 'ENABLED']
+    expected = ['ENABLED', 'PAUSED', 'ENABLED', 'DISABLED', 'ENABLED', 'FAULT', 'ENABLED']
+    assert record.states == expected
     first, paused = record.answers['at first'], record.answers['paused']
     assert (first.state, first.is_homed, first.is_busy) == ('ENABLED', True, False)
     assert paused.state == 'PAUSED'
@@ -350,7 +371,11 @@ def test_diagnostics_tell_rate_state_force_and_trips(record):
     assert int(last['watchdog_trips']) >= 2
     assert int(last['rejected']) > 50
     assert last['phase_kind'] == 'approach'
-    assert {'rate', 'missed', 'period_p99', 'lateness_p999', 'busy_p99', 'within'} <= set(last)
+    ages = [float(s['force_age_p50']) for s in record.statuses if 'force_age_p50' in s]
+    assert 0 <= min(ages) < 0.2
+    assert {'rate', 'missed', 'period_p99', 'lateness_p999', 'busy_p99', 'within'} <= {
+        key for status in record.statuses for key in status
+    }
     assert any(float(s['force_norm']) > 0 for s in record.statuses)
 
 

@@ -85,6 +85,10 @@ def rows(page: Path, pattern: str) -> set[tuple[str, str]]:
     return found
 
 
+BESIDE = ('crtk.py', 'probe_node.py', 'omni_node.py')
+"""Modules whose topics carry a device's name, or another's messages, or are counted below."""
+
+
 def made() -> set[tuple[str, str]]:
     """Names and short types of what the sources publish or serve."""
     found = set()
@@ -92,7 +96,7 @@ def made() -> set[tuple[str, str]]:
         for path in (ROOT / folder).glob('*.py'):
             for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
                 maker = isinstance(call, ast.Call) and getattr(call.func, 'attr', '')
-                if maker in ('create_publisher', 'create_service') and path.name != 'crtk.py':
+                if maker in ('create_publisher', 'create_service') and path.name not in BESIDE:
                     kind, name = (ast.unparse(argument) for argument in call.args[:2])
                     topic = eval(name, {'ros': ros, **vars(ros)})
                     found.add((topic.lstrip('/'), kind))

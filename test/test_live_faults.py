@@ -1,12 +1,15 @@
-"""A node is killed while the hand presses on the tissue: what the hand feels, and who lives on.
+"""A node is killed, or frozen, while the hand presses on the tissue: what the hand feels, and who
+lives on.
 
 Deadlines are measured by the stamps of the messages that were recorded. What the scheduler held the
 deciding loop up by is read off the same stamps and allowed for.
 """
 
+import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +38,8 @@ from rosbags.highlevel import AnyReader
 
 from bags.decode import decode
 from haptic_bridge.node import FOLLOW_PERIOD
-from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
+from haptic_bridge.settings import DeviceSettings
+from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec, WrenchStampedCodec
 from session.graph import MODULES, node_environment
 from session.status import Status
 
@@ -45,6 +49,8 @@ SECONDS = 7.0
 PRESSING = 0.25
 """[N] that says that the hand is down; at rest there it feels a little more."""
 TISSUE_DEADLINE, BRIDGE_DEADLINE = 0.150, 0.030
+FROZEN = 0.8
+PROFILE = DeviceSettings().load_profile()
 UNWRITTEN = 0.5
 """[s] of a bag that a killed recorder may take along."""
 SAME = 0.02
@@ -186,6 +192,35 @@ def test_palpation_goes_on_undisturbed_when_the_recorder_dies(
     assert norms[-1] > PRESSING
     last = fault.recording.at(cut_off.start) + times[-1]
     assert 0 < fault.killed - last < UNWRITTEN
+
+
+def test_force_fades_and_comes_back_when_the_tissue_is_frozen_and_goes_on(
+    session: LiveSession,
+) -> None:
+    session.wait_until_pressed(PRESSING)
+    lived = session.running()
+    stopped = time.time_ns()
+    os.kill(lived['tissue_sim'], signal.SIGSTOP)
+    time.sleep(FROZEN)
+    goes_on = time.time_ns()
+    os.kill(lived['tissue_sim'], signal.SIGCONT)
+    assert session.end() in (Status.OK, Status.FAILED)  # its rate was not held
+    assert deaths(session.said) == []
+    recording = Recording(session.bag)
+    times, forces = recording.read(SERVO_CF, WrenchStampedCodec(), 'force')
+    norms = np.linalg.norm(forces, axis=1)
+    start, end = recording.at(stopped), recording.at(goes_on)
+    delay = worst_gap(times, start - 0.1, end)
+    silent = (times > start + TISSUE_DEADLINE + FOLLOW_PERIOD + delay) & (times < end)
+    assert silent.sum() > 100
+    assert not norms[silent].any()
+    assert norms[times > end + 0.6].max() > PRESSING
+    assert norms.max() <= PROFILE.max_force
+    steps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
+    assert (steps <= PROFILE.max_slew * np.clip(np.diff(times), 1e-4, 5e-3) + 1e-3).all()
+    states = recording.messages('/haptic_bridge/operating_state')
+    assert 'FAULT' not in [decode(message).state for message in states]
+    assert 'no frame of the simulation for 100 ms' in session.said
 
 
 def assert_undisturbed(fault: Fault) -> None:

@@ -21,6 +21,7 @@ from tissue_sim.share import is_checkout, share_folder
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session')
 PUBLISHED_AS = {
+    '_pytest': 'pytest',
     'mpl_toolkits': 'matplotlib',
     'pydantic_core': 'pydantic',
     'ruamel': 'ruamel.yaml',
@@ -33,12 +34,14 @@ NOT_FROM_PYPI = {
     'cutting_trainer_msgs',
     'diagnostic_msgs',
     'geometry_msgs',
+    'omni_msgs',
     'rcl_interfaces',
     'rclpy',
     'rosidl_adapter',
     'rosidl_parser',
     'rosidl_pycommon',
     'rosidl_runtime_py',
+    'sensor_msgs',
     'std_msgs',
     'std_srvs',
 }
@@ -107,8 +110,9 @@ def test_every_ros_package_that_is_imported_is_declared() -> None:
         if element.tag.endswith('depend')
     }
     text = ''.join(path.read_text() for name in PACKAGES for path in (ROOT / name).glob('*.py'))
-    # crtk_msgs is used where it is installed; cutting_trainer_msgs is part of this package
-    optional = {'crtk_msgs', 'cutting_trainer_msgs'}
+    # crtk_msgs and omni_msgs are used where they are installed;
+    # cutting_trainer_msgs is part of this package
+    optional = {'crtk_msgs', 'cutting_trainer_msgs', 'omni_msgs'}
     for package in NOT_FROM_PYPI - optional:
         if re.search(rf'^\s*(from|import) {package}\b', text, re.MULTILINE):
             assert package in declared
@@ -310,5 +314,5 @@ def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(tmp_pa
     assert (share / 'cutting_trainer' / 'launch' / 'trainer.launch.py').is_file()
     assert list((share / 'cutting_trainer' / 'config' / 'scenes').glob('*.yaml'))
     programs = tmp_path / 'install' / 'cutting_trainer' / 'lib' / 'cutting_trainer'
-    assert {path.name for path in programs.iterdir()} == {*MODULES, 'trainer'}
+    assert {path.name for path in programs.iterdir()} == {*MODULES, 'omni_adapter', 'trainer'}
     assert all(os.access(path, os.X_OK) for path in programs.iterdir())

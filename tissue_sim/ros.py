@@ -79,6 +79,12 @@ def take_raw(subscription: Any) -> bytes | None:
     return None if taken is None else taken[0]
 
 
+def take_numbered(subscription: Any) -> tuple[bytes, int] | None:
+    """As `take_raw`, with the number that its publisher gave the message; 0 where it gives none."""
+    taken = subscription.handle.take_message(subscription.msg_type, True)
+    return None if taken is None else (taken[0], taken[1]['publication_sequence_number'] or 0)
+
+
 class Diagnostics:
     """Publishes one status of this node on /diagnostics, once a second.
 

@@ -85,6 +85,34 @@ class PeriodicLoop:
         }
 
 
+class Durations:
+    """Keeps the newest durations of one kind.
+
+    Args:
+        name: of the values in `report`.
+        window: how many are kept.
+    """
+
+    def __init__(self, name: str, *, window: int = 4096) -> None:
+        self._name = name
+        self._values = np.zeros(window, np.int64)
+        self._count = self._reported = 0
+
+    def add(self, duration_ns: int) -> None:
+        """Takes a duration [ns]."""
+        self._values[self._count % len(self._values)] = duration_ns
+        self._count += 1
+
+    def report(self) -> dict[str, float]:
+        """p50, p99, p999 and max [s] since the last report, of at most `window` durations."""
+        count = min(self._count - self._reported, len(self._values))
+        self._reported = self._count
+        if not count:
+            return {}
+        slots = np.arange(self._count - count, self._count) % len(self._values)
+        return _quantiles(self._name, self._values[slots] / NANOSECONDS, (50, 99, 99.9))
+
+
 def _quantiles(name: str, values: np.ndarray, percents: tuple[float, ...]) -> dict[str, float]:
     named = {
         f'{name}_p{str(p).replace(".", "")}': float(q)

@@ -1,0 +1,74 @@
+"""What a stream of stamped messages gives away about its sender: two of them, or a clock that
+jumps.
+"""
+
+CLOCK_JUMP = 0.5
+"""[s] by which stamps may move against the receiver's clock between two messages."""
+MEMORY = 1.0
+"""[s] in which numbers that go back twice are those of two senders; once is a restart."""
+_NANOSECONDS = 1_000_000_000
+
+
+class StreamWatch:
+    """Looks at one topic, message by message.
+
+    Every publisher numbers its messages from 1 on. A receiver of two of them sees the numbers go
+    back again and again; of one that has started again, once.
+
+    Limitations: two publishers whose messages come so close together that only ever one of them is
+    the newest are one to this; and an RMW that gives no numbers (0) hides them.
+
+    Args:
+        topic: for the sentences.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._number = 0
+        self._went_back: int | None = None
+        self._two_seen: int | None = None
+        self._offset: int | None = None
+
+    def see(self, number: int, stamp_ns: int, now_ns: int) -> str:
+        """Takes note of a message.
+
+        Args:
+            number: that its publisher gave it; 0 where unknown.
+            stamp_ns: in its header [ns]; 0 means invalid, and is not looked at.
+            now_ns: monotonic clock of the receiver [ns].
+
+        Returns:
+            What is wrong, as a sentence; '' if nothing is.
+        """
+        return self._count(number, now_ns) or self._compare(stamp_ns, now_ns)
+
+    def cause(self, now_ns: int) -> str:
+        """Why the stream cannot be trusted at this time [ns], '' if it can."""
+        if self._two_seen is None or now_ns - self._two_seen > MEMORY * _NANOSECONDS:
+            return ''
+        return f'{self._topic} has more than one publisher: end all but one'
+
+    def _count(self, number: int, now_ns: int) -> str:
+        back = 0 < number <= self._number
+        self._number = number
+        if not back:
+            return ''
+        before, self._went_back = self._went_back, now_ns
+        if before is None or now_ns - before > MEMORY * _NANOSECONDS:
+            return ''
+        self._two_seen = now_ns
+        return self.cause(now_ns)
+
+    def _compare(self, stamp_ns: int, now_ns: int) -> str:
+        if stamp_ns == 0:
+            return ''
+        before, self._offset = self._offset, stamp_ns - now_ns
+        if before is None:
+            return ''
+        jump = (self._offset - before) / _NANOSECONDS
+        if abs(jump) <= CLOCK_JUMP:
+            return ''
+        return (
+            f'the stamps of {self._topic} jumped by {jump:+.3g} s: its clock was set, '
+            'or its messages wait in a queue'
+        )

@@ -1,0 +1,72 @@
+"""Claims about the figures of `bench-timing`."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from session.bench_timing import cyclictest_row, measured
+from session.evidence import Status
+from tissue_sim.timing import Durations
+
+CYCLICTEST = """\
+# /dev/cpu_dma_latency set to 0us
+# Histogram
+000000 000000
+000003 000500
+000004 000497
+000120 000002
+# Total: 000000999
+# Min Latencies: 00003
+# Avg Latencies: 00004
+# Max Latencies: 70000
+# Histogram Overflows: 00001
+"""
+
+
+def test_quantiles_of_cyclictest_are_those_of_its_histogram_with_what_overflowed():
+    row = cyclictest_row(CYCLICTEST)
+    assert (row.p50, row.p999, row.largest) == pytest.approx((3e-6, 120e-6, 0.07))
+    assert cyclictest_row(CYCLICTEST.replace('00001\n', '00100\n')).p999 == np.inf
+
+
+def test_a_run_is_the_median_of_its_seconds_and_its_worst_second():
+    statuses = [
+        Status(
+            time,
+            'haptic_bridge',
+            0,
+            '',
+            {
+                f'lateness_{key}': str(v * scale)
+                for key, scale in (('p50', 1), ('p999', 5), ('max', 9))
+            },
+        )
+        for time, v in ((1.0, 99.0), (3.0, 2.0), (4.0, 3.0), (5.0, 8.0))
+    ]
+    (row,) = measured(statuses)
+    assert (row.p50, row.p999, row.worst_p999, row.largest) == (3, 15, 40, 72)
+
+
+def test_durations_are_reported_once():
+    durations = Durations('wait', window=100)
+    for value in range(1, 201):
+        durations.add(value * 1_000_000)
+    report = durations.report()
+    assert report['wait_p50'] == pytest.approx(0.1505)
+    assert report['wait_max'] == pytest.approx(0.2)
+    assert durations.report() == {}
+
+
+def test_the_bare_loop_says_how_late_it_woke():
+    done = subprocess.run(
+        [sys.executable, '-m', 'session.reference_loop', '0.3'],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    report = json.loads(done.stdout)
+    assert report['ticks'] + report['missed'] == pytest.approx(300, abs=100)
+    assert 0 <= report['lateness_p50'] <= report['lateness_p999'] <= report['lateness_max']

@@ -1,0 +1,116 @@
+"""The command `probe-device` on the emulated arm, as it should be and wrong in every way."""
+
+import json
+import os
+from collections.abc import Iterator
+from unittest import mock
+
+import pytest
+import rclpy
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from haptic_bridge import probe_node
+from session import cli
+from session import probe as command
+from session.probe import Emulation, ProbeOptions, run_probe
+from session.status import Status
+from tissue_sim.ros import STREAM, polled, take
+
+pytestmark = pytest.mark.real_time
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(command, 'STILL', 1.0)
+    with mock.patch.dict(os.environ):
+        yield
+
+
+def found(capsys: pytest.CaptureFixture[str], **options: object) -> tuple[Status, dict[str, dict]]:
+    status = run_probe(ProbeOptions(domain='free', as_json=True, **options))
+    return status, {check['name']: check for check in json.loads(capsys.readouterr().out)}
+
+
+@pytest.mark.slow
+def test_a_good_arm_passes_every_check(capsys):
+    for _ in range(3):  # again where the machine was held up
+        status, checks = found(capsys, emulation=Emulation(), push=True)
+        wrong = {name for name, check in checks.items() if check['verdict'] != 'ok'}
+        if not wrong:
+            break
+    assert (status, wrong) == (Status.OK, set())
+    assert {'publisher', 'rate', 'jitter', 'age', 'unit', 'handedness', 'force'} < set(checks)
+
+
+@pytest.mark.slow
+def test_an_arm_that_is_wrong_in_every_way_is_told_so_in_every_way(capsys):
+    wrong = Emulation(
+        arm={'rate': 200.0},
+        device={'length_unit': 'mm', 'mirrored_axis': 'y', 'force_sign': -1},
+    )
+    status, checks = found(capsys, emulation=wrong, push=True)
+    assert status == Status.FAILED
+    assert 150 < float(checks['rate']['measured'].split()[0]) < 250
+    for name, remedy in {
+        'rate': 'raise the rate',
+        'unit': 'device.length_unit: mm',
+        'handedness': 'left-handed',
+        'force': 'device.force_sign: -1',
+    }.items():
+        assert checks[name]['verdict'] == 'wrong'
+        assert remedy in checks[name]['sentence']
+
+
+@pytest.fixture
+def neighbour(monkeypatch: pytest.MonkeyPatch) -> Iterator[rclpy.node.Node]:
+    """A node in the domain that the probe will take."""
+    monkeypatch.setattr(probe_node, 'PATIENCE', 2.0)
+    with command.reserved_domain('free') as domain:
+        pass
+    os.environ.update(command.node_environment(domain))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node('neighbour', context=context)
+    node.domain = domain
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def probed(capsys, neighbour, **options):
+    status = run_probe(ProbeOptions(domain=neighbour.domain, as_json=True, **options))
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_nobody_there_is_wrong_and_the_arms_that_are_there_are_named(capsys, neighbour):
+    neighbour.create_publisher(PoseStamped, '/MTML/measured_cp', STREAM)
+    status, (check,) = probed(capsys, neighbour)
+    assert status == Status.FAILED
+    assert '/MTML/measured_cp' in check['sentence'] and '--arm' in check['sentence']
+
+
+def test_an_arm_that_is_silent_or_best_effort_is_wrong_and_nothing_is_sent_to_it(capsys, neighbour):
+    shy = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    neighbour.create_publisher(PoseStamped, 'arm/measured_cp', shy)
+    forces = polled(neighbour, WrenchStamped, 'arm/servo_cf', STREAM)
+    status, checks = probed(capsys, neighbour, push=True)
+    assert status == Status.FAILED
+    by_name = {check['name']: check for check in checks}
+    assert 'best effort' in by_name['publisher']['sentence']
+    assert 'sends nothing' in by_name['rate']['sentence']
+    assert take(forces) is None
+
+
+def test_two_arms_on_one_topic_are_told(capsys, neighbour):
+    for _ in range(2):
+        neighbour.create_publisher(PoseStamped, 'arm/measured_cp', STREAM)
+    _, checks = probed(capsys, neighbour)
+    assert '2 publishers' in checks[0]['sentence']
+
+
+def test_an_unknown_profile_is_bad_input_before_anything_starts(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(['probe-device', '--profile', 'tuch', '--emulated', '--domain', 'free'])
+    assert stopped.value.code == Status.BAD_INPUT
+    assert 'did you mean touch?' in capsys.readouterr().err
