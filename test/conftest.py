@@ -44,7 +44,8 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 def stand_stills(output: Path, since: float) -> list[float]:
     """Lengths [s] of those that ended after a time of the monotonic clock [s]."""
-    seen = [tuple(map(float, line.split())) for line in output.read_text().splitlines()]
+    whole, _, _ = output.read_text().rpartition('\n')
+    seen = [tuple(map(float, line.split())) for line in whole.splitlines()]
     return [length for ended, length in seen if ended > since]
 
 
