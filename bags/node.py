@@ -24,6 +24,7 @@ from tissue_sim.ros import (
     DIAGNOSTICS,
     EVENTS,
     FORCE,
+    FRAME_INPUTS,
     LATCHED,
     MESH,
     MESH_UPDATES,
@@ -36,7 +37,7 @@ from tissue_sim.ros import (
     run,
 )
 
-FORMAT_VERSION = '1'
+FORMAT_VERSION = '2'
 """Version of what our bags hold beyond rosbag2's own format; grows when a reader must know."""
 
 _POLL = 0.004
@@ -50,6 +51,7 @@ _CONFIGURED = {
     MESH: LATCHED,
     MESH_UPDATES: UPDATES,
     FORCE: STREAM,
+    FRAME_INPUTS: STREAM,
     CONTACT: STREAM,
     DIAGNOSTICS: EVENTS,
     f'{ARM}/measured_cp': STREAM,

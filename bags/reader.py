@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from io import SEEK_END, BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
+from bags.cdr import Decoder
 from bags.errors import BagError
 from bags.metadata import read_metadata
 
@@ -58,6 +59,7 @@ class Bag:
         self.custom_data = custom_data
         self._topics: dict[str, str] = {}
         self.schemas: dict[str, str] = {}
+        self._decoder = Decoder(self.schemas)
         self.complete = self._read_summary()
         if not self.complete:
             for _ in self._salvage():
@@ -84,6 +86,16 @@ class Bag:
                     message.sequence,
                     message.data,
                 )
+
+    def read(self, recorded: Recorded) -> Any:
+        """The message of what was recorded, by the bag's own definition of its type.
+
+        Arrays of numbers are NumPy arrays, all other arrays lists.
+
+        Raises:
+            BagError: the bytes are not such a message.
+        """
+        return self._decoder.decode(recorded.type, recorded.data)
 
     def _know(self, schema: Schema, channel: Channel) -> None:
         self._topics[channel.topic] = schema.name

@@ -81,6 +81,25 @@ def picture(
     Console().print(f'wrote {output or bag / "picture.png"}', highlight=False)
 
 
+@app.command(epilog=EXIT_STATUSES)
+def resimulate(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            '--with',
+            help='key=value of the scene that is to be otherwise; may be given again. Then the '
+            'recorded hand meets the changed tissue, and the differences are shown.',
+        ),
+    ] = None,
+) -> None:
+    """Compute a recorded session again: identical, or where it first differs. Needs no ROS."""
+    from session.recorded_scene import parse_changes
+    from session.resimulate import resimulate as compute
+
+    raise typer.Exit(int(compute(bag, parse_changes(changes or []))))
+
+
 @app.command('compare-cuts', epilog=EXIT_STATUSES)
 def compare_cuts(
     output: Annotated[
