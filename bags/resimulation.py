@@ -377,7 +377,7 @@ def _difference(
         return 'the bag lacks the contact that loaded this frame: it cannot be computed'
     if record.has_contact and record.pose is None:
         comparison.missing['poses of the device'] += 1
-    elif record.has_contact:
+    elif record.pose is not None:
         comparison.poses += 1
         if distance := pose_error(record.pose, record.contact):
             return f'the pose of the device puts the tool {distance:.3g} m from its contact'

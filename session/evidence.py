@@ -3,11 +3,12 @@
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.reader import Recorded, open_bag
+from bags.reader import open_bag
 from bags.sequences import SequenceCounter
 from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
 from session.graph import MODULES
@@ -96,7 +97,7 @@ def read_evidence(folder: Path) -> Evidence:
         elif message.topic == SERVO_CF:
             forces.append((time, np.linalg.norm(wrench_codec.decode(message.data).values[force])))
         elif message.topic == DIAGNOSTICS:
-            evidence.statuses += _statuses(message, time)
+            evidence.statuses += _statuses(bag.read(message), time)
     evidence.duration = (end - start) * NANOSECOND
     evidence.contacts = np.array(contacts, float).reshape(-1, 2)
     evidence.forces = np.array(forces, float).reshape(-1, 2)
@@ -109,16 +110,14 @@ def _count_publishers(topic: str) -> int:
     return len(MODULES) if topic in SHARED else 1
 
 
-def _statuses(message: Recorded, time: float) -> list[Status]:
-    from bags.decode import decode  # needs ROS, which the rest of this module does not
-
+def _statuses(array: Any, time: float) -> list[Status]:
     return [
         Status(
             time,
             status.name,
-            status.level[0],
+            status.level,
             status.message,
             {value.key: value.value for value in status.values},
         )
-        for status in decode(message).status
+        for status in array.status
     ]

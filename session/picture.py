@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from bags.decode import decode
-from bags.reader import Recorded, open_bag
+from bags.reader import open_bag
 from haptic_bridge.chain import INSIDE, NONE
 from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
 from session.errors import SessionError
@@ -88,7 +87,8 @@ def read_story(bag: Path, at: float | None) -> Story:
     places = [ContactCodec.fields[name] for name in ('device', 'blade_root', 'blade_tip')]
     tool, forces = [], []
     start, time = 0, 0.0
-    for message in open_bag(bag).messages():
+    opened = open_bag(bag)
+    for message in opened.messages():
         start = start or message.log_time
         time = (message.log_time - start) * 1e-9
         if message.topic == CONTACT:
@@ -98,7 +98,7 @@ def read_story(bag: Path, at: float | None) -> Story:
             norm = np.linalg.norm(wrenches.decode(message.data).values[force])
             forces.append([time, float(norm)])
         elif message.topic in (MESH, UPDATES) and (at is None or time <= at):
-            _follow(story.replica, message)
+            _follow(story.replica, message.topic, opened.read(message))
     story.moment = time if at is None else min(at, time)
     if story.replica.revision < 0:
         until = '' if at is None else f' in its first {at:g} s'
@@ -108,9 +108,8 @@ def read_story(bag: Path, at: float | None) -> Story:
     return story
 
 
-def _follow(replica: MeshReplica, message: Recorded) -> None:
-    content: Any = decode(message)
-    if message.topic == UPDATES:
+def _follow(replica: MeshReplica, topic: str, content: Any) -> None:
+    if topic == UPDATES:
         replica.apply(content)  # after a gap nothing fits until the next keyframe
     elif content.revision > replica.revision:
         replica.load(content)

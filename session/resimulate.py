@@ -95,11 +95,8 @@ def verdict(result: Comparison, took: float) -> list[str]:
         f'{result.meshes} meshes, {result.hashes} mesh hashes, {result.poses} poses'
     )
     speed = f'{result.seconds:.1f} s of the session in {took:.1f} s'
-    lines = [
-        compared,
-        *(f'not in the bag: {n} {what}' for what, n in (result.missing or {}).items()),
-    ]
-    lines.append(speed)
+    lacks = [f'not in the bag: {n} {what}' for what, n in result.missing.items()]
+    lines = [compared, *lacks, speed]
     if result.difference is None:
         whole = 'identical' if not result.missing else 'identical, as far as the bag can say'
         return [whole, *lines]

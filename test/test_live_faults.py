@@ -36,7 +36,6 @@ from live import (
 )
 from rosbags.highlevel import AnyReader
 
-from bags.decode import decode
 from haptic_bridge.node import FOLLOW_PERIOD
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec, WrenchStampedCodec
@@ -241,7 +240,7 @@ def assert_undisturbed(fault: Fault) -> None:
     np.testing.assert_allclose(after, before.mean(), rtol=SAME)
     assert zero_from(times, norms) < times[-1]
     states = fault.recording.messages('/haptic_bridge/operating_state')
-    assert 'FAULT' not in [decode(message).state for message in states]
+    assert 'FAULT' not in [fault.recording.bag.read(message).state for message in states]
 
 
 def end(witness: 'subprocess.Popen[str]') -> None:

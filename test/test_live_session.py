@@ -24,7 +24,6 @@ from live import (
 )
 from rosbags.highlevel import AnyReader
 
-from bags.decode import decode
 from bags.metadata import read_metadata
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.wire import (
@@ -174,12 +173,12 @@ def test_every_message_of_the_bag_is_counted_and_understood_by_rosbags(
 def test_deltas_lead_from_the_first_keyframe_to_the_arrays_of_a_later_one_bit_for_bit(
     recording: Recording,
 ) -> None:
-    keyframes = [decode(message) for message in recording.messages('/tissue/mesh')]
+    keyframes = [recording.bag.read(message) for message in recording.messages('/tissue/mesh')]
     later = keyframes[-1]
     replica = MeshReplica()
     replica.load(keyframes[0])
     assert replica.hash() == keyframes[0].state_hash
-    for delta in map(decode, recording.messages('/tissue/mesh_updates')):
+    for delta in map(recording.bag.read, recording.messages('/tissue/mesh_updates')):
         assert replica.apply(delta)
         if delta.state_hash:
             assert replica.hash() == delta.state_hash
