@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import SEEK_END, BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -128,21 +128,11 @@ class Bag:
                 yield schema, channel, message
 
     def _salvage(self) -> Iterator[tuple[Schema, Channel, Message]]:
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        for chunk in _complete_chunks(self.path):
-            messages = []
-            for record in breakup_chunk(chunk, validate_crc=True):
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                    self._know(schemas[record.schema_id], record)
-                elif isinstance(record, Message):
-                    messages.append(record)
-            for message in sorted(messages, key=lambda message: message.log_time):
-                channel = channels[message.channel_id]
-                yield schemas[channel.schema_id], channel, message
+        for chunk in salvage(self.path):
+            for channel in chunk.channels:
+                self._know(chunk.schemas[channel.schema_id], channel)
+            for channel, message in sorted(chunk.messages, key=lambda pair: pair[1].log_time):
+                yield chunk.schemas[channel.schema_id], channel, message
 
 
 def open_bag(folder: Path | str) -> Bag:
@@ -158,20 +148,82 @@ def open_bag(folder: Path | str) -> Bag:
     if folder.is_file():
         raise BagError(f'{folder} is a file: name the folder of the bag, {folder.parent}')
     information = read_metadata(folder)
-    names = information.get('relative_file_paths') or []
-    if information.get('storage_identifier') != 'mcap' or len(names) != 1:
-        raise BagError(f'{folder} is not a bag of one MCAP file: its metadata.yaml names {names}')
+    path = mcap_file(folder)
+    return Bag(path, dict(information.get('custom_data') or {}))
+
+
+def mcap_file(folder: Path) -> Path:
+    """The one MCAP file of a bag, by its metadata.yaml or, where there is none, by its ending.
+
+    Raises:
+        BagError: it is not a bag of one MCAP file.
+    """
+    try:
+        information = read_metadata(folder)
+        names = information.get('relative_file_paths') or []
+        storage = information.get('storage_identifier')
+    except BagError:
+        names, storage = [path.name for path in folder.glob('*.mcap')], 'mcap'
+        if not names:
+            raise
+    if storage != 'mcap' or len(names) != 1:
+        raise BagError(f'{folder} is not a bag of one MCAP file: it names {names}')
     path = folder / Path(names[0]).name
     if not path.is_file():
         raise BagError(f'{folder} lacks its file {path.name}')
     with path.open('rb') as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BagError(f'{path} is not an MCAP file')
-    return Bag(path, dict(information.get('custom_data') or {}))
+    return path
 
 
-def _complete_chunks(path: Path) -> Iterator[Chunk]:
-    """Chunks of a file up to the first record that is not all there."""
+@dataclass
+class Salvaged:
+    """One complete chunk of a file.
+
+    Attributes:
+        end: where it ends in the file [bytes].
+        damaged: its checksum does not hold: what was in it is gone.
+        schemas: all known so far, by number.
+        channels: that became known in this chunk.
+        messages: with their channels, in the order of the file.
+        strangers: messages of channels that were in a damaged chunk.
+    """
+
+    end: int
+    damaged: bool = False
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: list[Channel] = field(default_factory=list)
+    messages: list[tuple[Channel, Message]] = field(default_factory=list)
+    strangers: int = 0
+
+
+def salvage(path: Path) -> Iterator[Salvaged]:
+    """Reads chunk by chunk without index or end, up to the first record that is not all there."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for end, body in _complete_chunks(path):
+        chunk = Salvaged(end, schemas=schemas)
+        try:
+            records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
+        except Exception:  # whatever zstd, lz4 or the parser says of bytes that are not their own
+            chunk.damaged = True
+            records = []
+        for record in records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel) and record.id not in channels:
+                channels[record.id] = record
+                chunk.channels.append(record)
+            elif isinstance(record, Message) and record.channel_id in channels:
+                chunk.messages.append((channels[record.channel_id], record))
+            else:
+                chunk.strangers += isinstance(record, Message)
+        yield chunk
+
+
+def _complete_chunks(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Where each chunk of a file ends, and its bytes, up to a record that is not all there."""
     size = path.stat().st_size
     with path.open('rb') as file:
         file.seek(len(_MAGIC))
@@ -181,7 +233,7 @@ def _complete_chunks(path: Path) -> Iterator[Chunk]:
                 return
             body = file.read(length)
             if opcode == Opcode.CHUNK:
-                yield Chunk.read(ReadDataStream(BytesIO(body)))
+                yield file.tell(), body
 
 
 def _record_head(file: BinaryIO) -> tuple[int, int] | None:

@@ -81,6 +81,32 @@ def picture(
     Console().print(f'wrote {output or bag / "picture.png"}', highlight=False)
 
 
+@app.command(epilog='Exit status: that of the recorder.')
+def record(
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='New folder for the bag (default: as of demo).'),
+    ] = None,
+    scene: Annotated[
+        str, typer.Option(help='Scene that the nodes run: its text goes into the bag.')
+    ] = '',
+    seed: Annotated[int, typer.Option(help='Of the session; goes into the bag.')] = 0,
+    domain: Annotated[str, typer.Option(help='ROS domain (default: ROS_DOMAIN_ID, 0).')] = '',
+) -> None:
+    """Record every topic of a graph that runs elsewhere, until Ctrl-C."""
+    from session.record import run_recorder
+
+    run_recorder(output, scene, seed, domain)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def repair(bag: Annotated[Path, typer.Argument(help='Folder of the bag.')]) -> None:
+    """Make a bag that was cut off readable again, and say what is gone."""
+    from session.repair import repair as mend
+
+    mend(bag)
+
+
 @app.command(epilog=EXIT_STATUSES)
 def resimulate(
     bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
