@@ -17,6 +17,7 @@ from mcap.stream_reader import breakup_chunk
 from bags.cdr import Decoder
 from bags.errors import BagError
 from bags.metadata import read_metadata
+from bags.qos import OfferedQos, profiles_from
 
 _MAGIC = b'\x89MCAP0\r\n'
 _RECORD_HEAD = struct.Struct('<BQ')
@@ -58,6 +59,7 @@ class Bag:
         self.path = path
         self.custom_data = custom_data
         self._topics: dict[str, str] = {}
+        self._profiles: dict[str, str] = {}
         self.schemas: dict[str, str] = {}
         self._decoder = Decoder(self.schemas)
         self.complete = self._read_summary()
@@ -69,15 +71,22 @@ class Bag:
         """Type by topic."""
         return dict(self._topics)
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+    def profiles(self, topic: str) -> list[OfferedQos]:
+        """QoS that the publishers of a topic offered."""
+        return profiles_from(self._profiles.get(topic, ''))
+
+    def messages(
+        self, topics: Collection[str] | None = None, *, since: int = 0
+    ) -> Iterator[Recorded]:
         """Messages in the order of their log times (within a chunk only, where the end is missing).
 
         Args:
             topics: those to read; all by default.
+            since: smallest log time [ns since the epoch].
         """
-        source = self._indexed(topics) if self.complete else self._salvage()
+        source = self._indexed(topics, since) if self.complete else self._salvage()
         for schema, channel, message in source:
-            if topics is None or channel.topic in topics:
+            if (topics is None or channel.topic in topics) and message.log_time >= since:
                 yield Recorded(
                     channel.topic,
                     schema.name,
@@ -99,6 +108,7 @@ class Bag:
 
     def _know(self, schema: Schema, channel: Channel) -> None:
         self._topics[channel.topic] = schema.name
+        self._profiles[channel.topic] = channel.metadata.get('offered_qos_profiles', '')
         self.schemas[schema.name] = schema.data.decode()
 
     def _read_summary(self) -> bool:
@@ -119,11 +129,12 @@ class Bag:
             self._know(summary.schemas[channel.schema_id], channel)
         return True
 
-    def _indexed(self, topics: Collection[str] | None) -> Iterator[tuple[Schema, Channel, Message]]:
+    def _indexed(
+        self, topics: Collection[str] | None, since: int
+    ) -> Iterator[tuple[Schema, Channel, Message]]:
         with self.path.open('rb') as file:
-            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(
-                topics
-            ):
+            reader = make_reader(file, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(topics, start_time=since):
                 assert schema is not None
                 yield schema, channel, message
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from bags.errors import BagError
 from bags.reader import Bag
+from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, UPDATES, of_session
 from cutting.method import CutMethod, CutResult, SweepError, check_sweep
 from haptic_bridge.wire import ContactCodec, ForceSampleCodec, PoseStampedCodec, Sample
 from tissue_sim.mesh import TetMesh
@@ -22,9 +23,6 @@ from tissue_sim.replica import MeshReplica, state_hash
 from tissue_sim.simulation import Command, Frame, TissueSimulation, ToolContact
 from tissue_sim.tool_contact import tool_contact
 
-MESH, UPDATES = '/tissue/mesh', '/tissue/mesh_updates'
-FORCE, INPUTS = '/tissue/force', '/tissue/frame_inputs'
-CONTACT, POSE = '/tool/contact', '/arm/measured_cp'
 NO_ANSWER, APPLIED, EMPTY, REFUSED, LOST = range(5)
 """The numbers of `FrameInputs.answer`."""
 PoseError = Callable[[Sample, Any], float]
@@ -71,7 +69,13 @@ def read_frames(bag: Bag) -> list[FrameRecord]:
             break
     used = {(m.contact_sequence, nanoseconds(m.contact_stamp)) for m in inputs if m.has_contact}
     contacts = _samples(bag, CONTACT, ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used)
-    poses = _samples(bag, POSE, PoseStampedCodec(), lambda s: s.stamp_ns, {t for _, t in used})
+    poses = _samples(
+        bag,
+        of_session(POSE, bag.topics()),
+        PoseStampedCodec(),
+        lambda s: s.stamp_ns,
+        {t for _, t in used},
+    )
     stamps = {nanoseconds(m.header.stamp) for m in inputs}
     forces = _samples(bag, FORCE, ForceSampleCodec(), lambda s: s.stamp_ns, stamps)
     records = []

@@ -108,6 +108,44 @@ def repair(bag: Annotated[Path, typer.Argument(help='Folder of the bag.')]) -> N
 
 
 @app.command(epilog=EXIT_STATUSES)
+def replay(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    as_recorded: Annotated[
+        bool,
+        typer.Option(
+            '--as-recorded',
+            help='Show mesh and forces as they were; without it the recorded hand drives the '
+            'simulation afresh.',
+        ),
+    ] = False,
+    rate: Annotated[
+        float, typer.Option(min=0.01, max=100.0, help='Seconds of the session in one second.')
+    ] = 1.0,
+    start: Annotated[float, typer.Option(min=0.0, help='Where to begin [s].')] = 0.0,
+    loop: Annotated[bool, typer.Option('--loop', help='Begin again at the end.')] = False,
+    domain: Annotated[
+        str, typer.Option(help='ROS domain, or "free" (default: ROS_DOMAIN_ID, 0).')
+    ] = '',
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='Record the replay into a new bag (not as recorded).'),
+    ] = None,
+    drive_device: Annotated[
+        bool,
+        typer.Option('--drive-device', help='Let the force reach a live device. Without it none.'),
+    ] = False,
+) -> None:
+    """Play a recorded session into the graph. Space pauses, s steps one frame, q ends."""
+    from session.domain import parse_domain
+    from session.replay import ReplayOptions
+    from session.replay import replay as play
+
+    number = parse_domain(domain)
+    options = ReplayOptions(bag, as_recorded, rate, start, loop, number, output, drive_device)
+    raise typer.Exit(int(play(options)))
+
+
+@app.command(epilog=EXIT_STATUSES)
 def resimulate(
     bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
     changes: Annotated[

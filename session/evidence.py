@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from bags.reader import open_bag
 from bags.sequences import SequenceCounter
+from bags.topics import CONTACT, DIAGNOSTICS, SERVO_CF, of_session
 from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
 from session.graph import MODULES
 
-CONTACT, SERVO_CF, DIAGNOSTICS = '/tool/contact', '/arm/servo_cf', '/diagnostics'
 SHARED = (DIAGNOSTICS, '/parameter_events', '/rosout')
 """Topics that every node publishes on: their messages are of several sequences."""
 NANOSECOND = 1e-9
@@ -84,6 +84,7 @@ def read_evidence(folder: Path) -> Evidence:
     state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
     contact_codec, wrench_codec = ContactCodec(), WrenchStampedCodec()
     contacts, forces = [], []
+    servo_cf = of_session(SERVO_CF, bag.topics())
     start = end = 0
     for message in bag.messages():
         start = start or message.log_time
@@ -94,7 +95,7 @@ def read_evidence(folder: Path) -> Evidence:
         evidence.messages[message.topic] = evidence.messages.get(message.topic, 0) + 1
         if message.topic == CONTACT:
             contacts.append((time, contact_codec.decode(message.data).values[state][0] != 0))
-        elif message.topic == SERVO_CF:
+        elif message.topic == servo_cf:
             forces.append((time, np.linalg.norm(wrench_codec.decode(message.data).values[force])))
         elif message.topic == DIAGNOSTICS:
             evidence.statuses += _statuses(bag.read(message), time)

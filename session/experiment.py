@@ -14,7 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from bags.reader import Bag
-from bags.resimulation import POSE, FrameRecord, Recomputation, contact_message, read_frames
+from bags.resimulation import FrameRecord, Recomputation, contact_message, read_frames
+from bags.topics import POSE, of_session
 from haptic_bridge.chain import NONE
 from haptic_bridge.force_path import ForcePath
 from haptic_bridge.operating_state import State
@@ -130,7 +131,9 @@ def run_experiment(bag: Bag, scene: Scene, computed: Recomputation) -> Run:
         SessionError: the bag has no poses, or the changed session ends in a FAULT.
     """
     codec = PoseStampedCodec()
-    poses = [codec.decode(recorded.data) for recorded in bag.messages([POSE])]
+    poses = [
+        codec.decode(recorded.data) for recorded in bag.messages([of_session(POSE, bag.topics())])
+    ]
     if not poses:
         raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
     hand = _Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))

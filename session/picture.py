@@ -12,6 +12,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
 from bags.reader import open_bag
+from bags.topics import CONTACT, MESH, SERVO_CF, UPDATES, of_session
 from haptic_bridge.chain import INSIDE, NONE
 from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
 from session.errors import SessionError
@@ -19,8 +20,6 @@ from tissue_sim.replica import MeshReplica
 
 Floats = NDArray[np.float64]
 
-MESH, UPDATES = '/tissue/mesh', '/tissue/mesh_updates'
-CONTACT, SERVO_CF = '/tool/contact', '/arm/servo_cf'
 FORMATS = ('.png', '.svg', '.pdf')
 
 _TISSUE, _CUT = np.array([0.86, 0.50, 0.42]), np.array([0.62, 0.04, 0.08])
@@ -88,13 +87,14 @@ def read_story(bag: Path, at: float | None) -> Story:
     tool, forces = [], []
     start, time = 0, 0.0
     opened = open_bag(bag)
+    servo_cf = of_session(SERVO_CF, opened.topics())
     for message in opened.messages():
         start = start or message.log_time
         time = (message.log_time - start) * 1e-9
         if message.topic == CONTACT:
             values = contacts.decode(message.data).values
             tool.append([time, *(x for place in places for x in values[place]), *values[state]])
-        elif message.topic == SERVO_CF:
+        elif message.topic == servo_cf:
             norm = np.linalg.norm(wrenches.decode(message.data).values[force])
             forces.append([time, float(norm)])
         elif message.topic in (MESH, UPDATES) and (at is None or time <= at):
