@@ -69,13 +69,8 @@ def read_frames(bag: Bag) -> list[FrameRecord]:
             break
     used = {(m.contact_sequence, nanoseconds(m.contact_stamp)) for m in inputs if m.has_contact}
     contacts = _samples(bag, CONTACT, ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used)
-    poses = _samples(
-        bag,
-        of_session(POSE, bag.topics()),
-        PoseStampedCodec(),
-        lambda s: s.stamp_ns,
-        {t for _, t in used},
-    )
+    pose, wanted = of_session(POSE, bag.topics()), {stamp for _, stamp in used}
+    poses = _samples(bag, pose, PoseStampedCodec(), lambda s: s.stamp_ns, wanted)
     stamps = {nanoseconds(m.header.stamp) for m in inputs}
     forces = _samples(bag, FORCE, ForceSampleCodec(), lambda s: s.stamp_ns, stamps)
     records = []

@@ -164,6 +164,41 @@ def resimulate(
     raise typer.Exit(int(compute(bag, parse_changes(changes or []))))
 
 
+@app.command(epilog=EXIT_STATUSES)
+def report(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='Page to write (default: BAG/report.html).'),
+    ] = None,
+) -> None:
+    """Write a recorded session on one page: force, depth, speed, the cut against the plan."""
+    from session.html_report import write_report
+
+    write_report(bag, output or bag / 'report.html')
+    Console().print(f'wrote {output or bag / "report.html"}', highlight=False)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def export(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    output: Annotated[
+        Path,
+        typer.Argument(
+            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), or a folder for CSV.'
+        ),
+    ],
+    at: Annotated[
+        float | None, typer.Option(min=0.0, help='Moment of the mesh [s] (default: the end).')
+    ] = None,
+) -> None:
+    """Write a bag's poses and forces as CSV, or its tissue as a mesh."""
+    from session.export import export as write
+
+    for file in write(bag, output, at):
+        Console().print(f'wrote {file}', highlight=False)
+
+
 @app.command('compare-cuts', epilog=EXIT_STATUSES)
 def compare_cuts(
     output: Annotated[

@@ -131,9 +131,8 @@ def run_experiment(bag: Bag, scene: Scene, computed: Recomputation) -> Run:
         SessionError: the bag has no poses, or the changed session ends in a FAULT.
     """
     codec = PoseStampedCodec()
-    poses = [
-        codec.decode(recorded.data) for recorded in bag.messages([of_session(POSE, bag.topics())])
-    ]
+    topic = of_session(POSE, bag.topics())
+    poses = [codec.decode(recorded.data) for recorded in bag.messages([topic])]
     if not poses:
         raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
     hand = _Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))
