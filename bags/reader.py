@@ -134,7 +134,7 @@ class Bag:
     ) -> Iterator[tuple[Schema, Channel, Message]]:
         with self.path.open('rb') as file:
             reader = make_reader(file, validate_crcs=True)
-            for schema, channel, message in reader.iter_messages(topics, start_time=since):
+            for schema, channel, message in reader.iter_messages(topics, starting_at=since):
                 assert schema is not None
                 yield schema, channel, message
 

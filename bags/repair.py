@@ -60,6 +60,7 @@ def repair_bag(folder: Path) -> Repair:
         writer = BagWriter(temporary / folder.resolve().name, custom_data=_custom_data(folder))
         for chunk in salvage(path):
             _copy(chunk, writer)
+            writer.flush()
             result.cut_off = path.stat().st_size - chunk.end
             result.damaged += chunk.damaged
             result.strangers += chunk.strangers
@@ -77,6 +78,24 @@ def repair_bag(folder: Path) -> Repair:
     result.seconds = (tally.end - tally.start) * 1e-9
     result.silence = max(modified - tally.end * 1e-9, 0.0) if tally.end else 0.0
     return result
+
+
+def copy_bag(source: Path, target: Path) -> None:
+    """Writes a whole bag once more, as few chunks as it takes, its messages bit for bit.
+
+    Args:
+        source: folder of the bag.
+        target: folder of the new one.
+
+    Raises:
+        BagError: it is not a bag, or the new one cannot be written.
+    """
+    writer = BagWriter(target, custom_data=_custom_data(source))
+    for chunk in salvage(mcap_file(source)):
+        _copy(chunk, writer)
+    writer.close()
+    if writer.failure:
+        raise BagError(writer.failure)
 
 
 def _is_whole(folder: Path) -> bool:
@@ -108,7 +127,6 @@ def _copy(chunk: Salvaged, writer: BagWriter) -> None:
         )
     for channel, m in chunk.messages:
         writer.write(channel.topic, m.log_time, m.publish_time, m.data, m.sequence)
-    writer.flush()
 
 
 @contextmanager

@@ -13,8 +13,9 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from bags.frames import FrameRecord, contact_message, read_frames
 from bags.reader import Bag
-from bags.resimulation import FrameRecord, Recomputation, contact_message, read_frames
+from bags.resimulation import Recomputation
 from bags.topics import POSE, of_session
 from haptic_bridge.chain import NONE
 from haptic_bridge.force_path import ForcePath

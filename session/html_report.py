@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from bags.player import first_time
 from bags.reader import Bag, open_bag
 from bags.tissue import tissue_at
-from bags.topics import CUTS
+from bags.topics import CUTS, POSE, of_session
 from haptic_bridge.arm_settings import ScriptSettings
 from haptic_bridge.chain import INSIDE, NONE
+from haptic_bridge.wire import PoseStampedCodec
 from session.errors import SessionError
 from session.evidence import read_evidence
 from session.incision import depths, distance_to_ways, extent, planned_ways, surface_length
@@ -115,7 +116,7 @@ def _body(
         _image(_path_figure(story, script), 'Way of the tip from above, and the plan.'),
         '<h2>Force, depth, speed</h2>',
         _image(
-            _time_figure(story, tool, depth),
+            _time_figure(story, tool, depth, hand_speed(bag)),
             "Grey: contact; red: the blade is in the tissue. Depth is that of the blade's end "
             'under the surface at rest. Marked are the largest peaks of the force.',
         ),
@@ -197,6 +198,21 @@ def _state_at(story: Story, times: Floats) -> Floats:
     return story.tool[np.maximum(at, 0), 10]
 
 
+def hand_speed(bag: Bag) -> Floats:
+    """Time [s] and speed [m/s] of the device, from 20 ms to 20 ms of its stamps, shape (n, 2)."""
+    topic, codec = of_session(POSE, bag.topics()), PoseStampedCodec()
+    recorded = list(bag.messages([topic]))[::_EVERY]
+    if len(recorded) < 2:
+        return np.zeros((0, 2))
+    samples = [codec.decode(message.data) for message in recorded]
+    begin = (recorded[0].log_time - first_time(bag)) * 1e-9
+    times = begin + np.array([sample.stamp_ns - samples[0].stamp_ns for sample in samples]) * 1e-9
+    places = np.array([sample.values[:3] for sample in samples])
+    ways = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    steps = np.diff(times)
+    return np.column_stack([times[1:], ways / np.maximum(steps, 1e-6)])
+
+
 def force_peaks(forces: Floats) -> Floats:
     """The largest forces, each the largest within half a second to either side.
 
@@ -224,18 +240,15 @@ def _peaks(story: Story) -> list[tuple[str, ...]]:
     ]
 
 
-def _time_figure(story: Story, tool: Floats, depth: Floats) -> Figure:
+def _time_figure(story: Story, tool: Floats, depth: Floats, speed: Floats) -> Figure:
     figure = Figure(figsize=(9.0, 6.4), layout='constrained')
     rows: Any = figure.subplots(3, 1, sharex=True)
-    times = tool[:, 0]
-    speed = np.zeros(len(tool))
-    if len(tool) > 1:
-        speed = np.linalg.norm(np.gradient(tool[:, 1:4], times, axis=0), axis=1)
     peaks = force_peaks(story.forces)
+    times = tool[:, 0]
     curves: list[tuple[str, Floats, Floats]] = [
         ('force on the hand [N]', story.forces[:, 0], story.forces[:, 1]),
         ('depth [mm]', times, depth * _MM),
-        ('speed of the tip [mm/s]', times, speed * _MM),
+        ('speed of the hand [mm/s]', speed[:, 0], speed[:, 1] * _MM),
     ]
     for axes, (label, at, curve) in zip(rows, curves, strict=True):
         for state, colour in ((INSIDE, '#e8b4b0'), (None, '#dddddd')):

@@ -10,8 +10,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from bags.errors import BagError
+from bags.frames import first_keyframe
 from bags.reader import Bag
-from bags.resimulation import first_keyframe
 from session.errors import SessionError
 
 MESH_FILE = 'tissue.vtk'

@@ -11,8 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
+from bags.comparison import Comparison, compare
 from bags.reader import Bag, open_bag
-from bags.resimulation import Comparison, Recomputation, compare
+from bags.resimulation import Recomputation
 from cutting.methods import make_method
 from cutting.warm_up import warm_up as warm_up_cutting
 from haptic_bridge import chain
