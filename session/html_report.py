@@ -226,7 +226,9 @@ def force_peaks(forces: Floats) -> Floats:
     peaks: list[Floats] = []
     while len(left) and len(peaks) < _PEAKS:
         top = left[left[:, 1].argmax()]
-        peaks.append(top)
+        around = forces[np.abs(forces[:, 0] - top[0]) <= _BETWEEN_PEAKS]
+        if top[1] >= around[:, 1].max():  # else the shoulder of a larger one
+            peaks.append(top)
         left = left[np.abs(left[:, 0] - top[0]) > _BETWEEN_PEAKS]
     return np.array(peaks, float).reshape(-1, 2)
 

@@ -4,6 +4,7 @@ import itertools
 import os
 import random
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -28,6 +29,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from bags.reader import open_bag
+from bags.repair import repair_bag
 from tissue_sim.ros import CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
 
 ROOT = Path(__file__).parents[1]
@@ -287,6 +289,29 @@ def test_losses_are_on_diagnostics_and_they_and_all_parameters_are_in_the_bag(
     assert values['lost'] == '0'
     assert int(values['received /diagnostics']) >= int(values['written /diagnostics']) > 0
     assert int(values['bytes']) > 0
+
+
+def test_a_full_disk_does_not_end_the_recorder_and_the_loss_is_counted_and_said(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    publisher = heard(node, PoseStamped, '/stream', QoSProfile(depth=1000))
+    sent = publish_at_1_khz(publisher, poses(300))
+    time.sleep(0.5)
+    path = recorder.folder / 'bag_0.mcap'
+    limit = path.stat().st_size + 100
+    resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+    sent += publish_at_1_khz(publisher, poses(700))
+    time.sleep(1.5)
+    assert recorder.process.poll() is None
+    said = recorder.end()
+    assert recorder.process.returncode == 0
+    written, lost = map(
+        int, re.search(r'/stream: 1000 received, (\d+) written, (\d+) lost', said).groups()
+    )
+    assert written + lost == 1000 and lost > 0
+    assert f'cannot write {path}: File too large' in said
+    assert repair_bag(recorder.folder).messages > 0
+    assert recorded(recorder.folder, '/stream') == sent[:written]
 
 
 @pytest.mark.parametrize(
