@@ -12,7 +12,7 @@ from bags.reader import Bag
 from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, of_session
 from haptic_bridge.wire import ContactCodec, ForceSampleCodec, PoseStampedCodec, Sample
 
-NO_ANSWER, APPLIED, EMPTY, REFUSED, LOST = range(5)
+NO_ANSWER, APPLIED, EMPTY, REFUSED, LOST, GIVEN_UP = range(6)
 """The numbers of `FrameInputs.answer`."""
 
 

@@ -6,9 +6,9 @@ answer to a cut that it found. `tissue/frame_inputs` names both for every frame.
 
 import numpy as np
 
-from bags.frames import EMPTY, LOST, NO_ANSWER, REFUSED
+from bags.frames import APPLIED, EMPTY, GIVEN_UP, LOST, NO_ANSWER, REFUSED
 from cutting.method import CutMethod, CutResult, SweepError, check_sweep
-from tissue_sim.mesh import TetMesh
+from tissue_sim.mesh import TetMesh, Touched
 from tissue_sim.simulation import Command, Frame, TissueSimulation, ToolContact
 
 
@@ -21,11 +21,13 @@ class Recomputation:
 
     Attributes:
         area: of the incision, one side, at rest [m^2].
+        touched: what the last change of connectivity wrote, None before the first.
     """
 
     def __init__(self, simulation: TissueSimulation, method: CutMethod) -> None:
         self.simulation = simulation
         self.area = 0.0
+        self.touched: Touched | None = None
         self._method = method
         self._asked: tuple[Frame, np.ndarray] | None = None
         self._begin_anew()
@@ -53,9 +55,12 @@ class Recomputation:
             return 'a cut was answered that is not asked for now'
         frame, displacement = self._asked
         self._asked = None
-        if answer in (REFUSED, LOST):
-            self._outdated |= answer == LOST
-            self.simulation.cut_failed()
+        if answer in (REFUSED, LOST, GIVEN_UP):
+            self._outdated |= answer != REFUSED
+            if answer == LOST:
+                self.simulation.cut_failed()
+            else:
+                self.simulation.cut_done()
             return ''
         try:
             result = self._cut(frame, displacement)
@@ -67,15 +72,18 @@ class Recomputation:
         self._apply(result)
         return ''
 
-    def answer(self) -> None:
-        """Cuts what was asked for and takes the answer, whatever it is."""
+    def answer(self) -> int:
+        """Cuts what was asked for, if anything was; returns what came of it, as recorded."""
         if self._asked is None:
-            return
+            return NO_ANSWER
         (frame, displacement), self._asked = self._asked, None
         try:
-            self._apply(self._cut(frame, displacement))
+            result = self._cut(frame, displacement)
         except SweepError:
-            self.simulation.cut_failed()
+            self.simulation.cut_done()
+            return REFUSED
+        self._apply(result)
+        return EMPTY if result.delta.empty else APPLIED
 
     def frame(self, contact: ToolContact | None) -> Frame:
         """Computes a frame."""
@@ -100,4 +108,4 @@ class Recomputation:
             self.simulation.cut_done()
         else:
             self._mesh.apply(result.delta)
-            self.simulation.apply_cut(result.delta)
+            self.touched = self.simulation.apply_cut(result.delta)

@@ -120,7 +120,7 @@ def new_bag(asked: Path | None, scene: str) -> Path:
         SessionError: it exists already, or cannot be made.
     """
     if asked == Path():
-        raise SessionError('the bag has no name: give the path of a new folder')
+        raise SessionError('--bag names no folder: give the path of a new one')
     if asked is None:
         folder = SESSIONS / f'{scene}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}'
     else:

@@ -5,7 +5,7 @@ and the tissue has its frames at the poses where they were recorded. A cut is an
 later. The hand does not yield to the force: it goes where it went.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,7 +24,7 @@ from haptic_bridge.surface import Surface
 from haptic_bridge.wire import PoseStampedCodec, Sample
 from session.errors import SessionError
 from session.scene import Scene
-from tissue_sim.simulation import Frame
+from tissue_sim.simulation import Frame, ToolContact
 from tissue_sim.tool_contact import tool_contact
 
 _FRAME_NS = 33_333_333
@@ -98,8 +98,16 @@ class Run:
 
 
 @dataclass
-class _Hand:
-    """Device, force loop and what they have come to so far."""
+class Hand:
+    """Device, force loop and what they have come to so far.
+
+    Attributes:
+        path: the force loop.
+        state: its operating state.
+        surface, sample: of the tissue, newest; the sample until it was taken.
+        contact: as the last tick had it, None before the first.
+        ticks: time [ns], norm of the force [N], whether something is touched.
+    """
 
     path: ForcePath
     state: State = State.DISABLED
@@ -136,17 +144,12 @@ def run_experiment(bag: Bag, scene: Scene, computed: Recomputation) -> Run:
     poses = [codec.decode(recorded.data) for recorded in bag.messages([topic])]
     if not poses:
         raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
-    hand = _Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))
-    substeps = diverged = next_pose = 0
-    for record in read_frames(bag):
-        until = _time_of_contact(record)
-        while next_pose < len(poses) and poses[next_pose].stamp_ns <= until:
-            hand.tick(poses[next_pose])
-            next_pose += 1
-        frame = _frame(computed, hand)
+    hand = Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))
+    substeps = diverged = 0
+    untils = [_time_of_contact(record) for record in read_frames(bag)]
+    for frame, _ in closed_loop(poses, untils, hand, computed):
         substeps += frame.substeps
         diverged += frame.diverged
-        _show(computed, hand, frame)
     computed.answer()
     times, forces, contact = (np.array(column) for column in zip(*hand.ticks, strict=True))
     return Run(
@@ -161,21 +164,43 @@ def run_experiment(bag: Bag, scene: Scene, computed: Recomputation) -> Run:
     )
 
 
+def closed_loop(
+    poses: Sequence[Sample], untils: Iterable[int], hand: Hand, computed: Recomputation
+) -> Iterator[tuple[Frame, int]]:
+    """Ticks the force loop with each pose, and computes a frame whenever its time has come.
+
+    Args:
+        poses: of the device, in order.
+        untils: for each frame, stamp [ns] of the last pose before it.
+        hand: at its beginning.
+        computed: before its first frame.
+
+    Yields:
+        Each frame, and what came of the cut asked for before it (see `FrameInputs.answer`).
+    """
+    next_pose = 0
+    for until in untils:
+        while next_pose < len(poses) and poses[next_pose].stamp_ns <= until:
+            hand.tick(poses[next_pose])
+            next_pose += 1
+        answer = computed.answer()
+        frame = computed.frame(_contact(computed, hand))
+        _show(computed, hand, frame)
+        yield frame, answer
+
+
 def _time_of_contact(record: FrameRecord) -> int:
     """Stamp of the pose [ns] that a frame has seen last."""
     return record.pose.stamp_ns if record.pose is not None else record.time - _FRAME_NS
 
 
-def _frame(computed: Recomputation, hand: _Hand) -> Frame:
-    computed.answer()
-    contact = None
-    if hand.contact is not None:
-        message = contact_message(hand.contact)
-        contact = tool_contact(message, computed.simulation.mesh.node_count)
-    return computed.frame(contact)
+def _contact(computed: Recomputation, hand: Hand) -> ToolContact | None:
+    if hand.contact is None:
+        return None
+    return tool_contact(contact_message(hand.contact), computed.simulation.mesh.node_count)
 
 
-def _show(computed: Recomputation, hand: _Hand, frame: Frame) -> None:
+def _show(computed: Recomputation, hand: Hand, frame: Frame) -> None:
     """Gives the force loop what a frame came to."""
     simulation = computed.simulation
     if not frame.diverged:

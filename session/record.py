@@ -26,6 +26,8 @@ def run_recorder(output: Path | None, scene: str, seed: int, domain: str) -> Non
     number = parse_domain(domain)
     if number == 'free':
         raise SessionError('--domain free has no graph in it: give the domain of the nodes')
+    if output == Path():
+        raise SessionError('--output names no folder: give the path of a new one')
     path = load_scene(scene).path if scene else None
     bag = new_bag(output, path.stem if path else RECORDER_NODE)
     command = recorder_command(path, bag, seed)

@@ -19,6 +19,10 @@ TEXTS = {page: page.read_text(encoding='utf-8') for page in PAGES}
 CRTK = {'OperatingState': 'operating_state', 'StringStamped': 'command'}
 
 
+ELSEWHERE = ('player_node.py',)
+"""Whose topics are those of a session played again."""
+
+
 def launched(*arguments: str) -> str:
     command = [sys.executable, str(ROOT / 'trainer'), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
@@ -96,7 +100,7 @@ def made() -> set[tuple[str, str]]:
         for path in (ROOT / folder).glob('*.py'):
             for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
                 maker = isinstance(call, ast.Call) and getattr(call.func, 'attr', '')
-                if maker in ('create_publisher', 'create_service') and path.name not in BESIDE:
+                if maker in ('create_publisher', 'create_service') and path.name not in BESIDE + ELSEWHERE:
                     kind, name = (ast.unparse(argument) for argument in call.args[:2])
                     topic = eval(name, {'ros': ros, **vars(ros)})
                     found.add((topic.lstrip('/'), kind))
