@@ -168,7 +168,8 @@ def test_every_message_of_the_bag_is_counted_and_understood_by_rosbags(
     counts: Counter[str] = Counter()
     with AnyReader([session.bag]) as reader:
         for connection, _, data in reader.messages():
-            reader.deserialize(data, connection.msgtype)
+            if '/srv/' not in connection.msgtype:  # rosbags has no types of service events
+                reader.deserialize(data, connection.msgtype)
             counts[connection.topic] += 1
     entries = read_metadata(session.bag)['topics_with_message_count']
     listed = {entry['topic_metadata']['name']: entry['message_count'] for entry in entries}
