@@ -12,8 +12,9 @@ from bags.reader import Bag
 from bags.resimulation import Recomputation
 from bags.topics import MESH, UPDATES
 from haptic_bridge.wire import ForceSampleCodec, Sample
+from tissue_sim.contact import Frame
 from tissue_sim.replica import MeshReplica, state_hash
-from tissue_sim.simulation import Frame, TissueSimulation
+from tissue_sim.simulation import TissueSimulation
 from tissue_sim.tool_contact import tool_contact
 
 PoseError = Callable[[Sample, Any], float]

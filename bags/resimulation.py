@@ -8,8 +8,9 @@ import numpy as np
 
 from bags.frames import APPLIED, EMPTY, GIVEN_UP, LOST, NO_ANSWER, REFUSED
 from cutting.method import CutMethod, CutResult, SweepError, check_sweep
+from tissue_sim.contact import Command, Frame, ToolContact
 from tissue_sim.mesh import TetMesh, Touched
-from tissue_sim.simulation import Command, Frame, TissueSimulation, ToolContact
+from tissue_sim.simulation import TissueSimulation
 
 
 class Recomputation:

@@ -24,7 +24,7 @@ from haptic_bridge.surface import Surface
 from haptic_bridge.wire import PoseStampedCodec, Sample
 from session.errors import SessionError
 from session.scene import Scene
-from tissue_sim.simulation import Frame, ToolContact
+from tissue_sim.contact import Frame, ToolContact
 from tissue_sim.tool_contact import tool_contact
 
 _FRAME_NS = 33_333_333

@@ -95,7 +95,7 @@ def arm_command(scene: Path, **parameters: object) -> NodeCommand:
     return NodeCommand(ARM_NODE, _argv(MODULES[ARM_NODE], values))
 
 
-def _argv(module: str, parameters: dict[str, object]) -> tuple[str, ...]:
+def _argv(module: str, parameters: Mapping[str, object]) -> tuple[str, ...]:
     # What a node says goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
     argv = [sys.executable, '-m', module, '--ros-args', '--disable-external-lib-logs']
     for key, value in parameters.items():
