@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -42,6 +43,7 @@ def restore_scene(bag: Bag, folder: Path, changes: Mapping[str, str] | None = No
     meshio.Mesh(np.asarray(mesh.rest).reshape(-1, 3), cells).write(
         folder / MESH_FILE, file_format='vtk'
     )
+    _translate(scene['tissue'])
     scene['tissue']['mesh'] = MESH_FILE
     scene['tissue']['unit'] = 'm'
     for key, value in (changes or {}).items():
@@ -51,6 +53,13 @@ def restore_scene(bag: Bag, folder: Path, changes: Mapping[str, str] | None = No
     yaml.dump(scene, out)
     path.write_text(out.getvalue(), encoding='utf-8')
     return path
+
+
+def _translate(tissue: dict[str, Any]) -> None:
+    """Says in today's keys what scenes of former versions said in others."""
+    integration = tissue.get('integration') or {}
+    if 'method' in integration:
+        tissue.setdefault('integrator', integration.pop('method'))
 
 
 def parse_changes(arguments: list[str]) -> dict[str, str]:

@@ -19,10 +19,6 @@ TEXTS = {page: page.read_text(encoding='utf-8') for page in PAGES}
 CRTK = {'OperatingState': 'operating_state', 'StringStamped': 'command'}
 
 
-ELSEWHERE = ('player_node.py',)
-"""Whose topics are those of a session played again."""
-
-
 def launched(*arguments: str) -> str:
     command = [sys.executable, str(ROOT / 'trainer'), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
@@ -89,7 +85,7 @@ def rows(page: Path, pattern: str) -> set[tuple[str, str]]:
     return found
 
 
-BESIDE = ('crtk.py', 'probe_node.py', 'omni_node.py')
+BESIDE = ('crtk.py', 'probe_node.py', 'omni_node.py', 'player_node.py')
 """Modules whose topics carry a device's name, or another's messages, or are counted below."""
 
 

@@ -218,7 +218,7 @@ def test_force_fades_and_comes_back_when_the_tissue_is_frozen_and_goes_on(
     steps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
     assert (steps <= PROFILE.max_slew * np.clip(np.diff(times), 1e-4, 5e-3) + 1e-3).all()
     states = recording.messages('/haptic_bridge/operating_state')
-    assert 'FAULT' not in [decode(message).state for message in states]
+    assert 'FAULT' not in [recording.bag.read(message).state for message in states]
     assert 'no frame of the simulation for 100 ms' in session.said
 
 
