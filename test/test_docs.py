@@ -96,10 +96,7 @@ def made() -> set[tuple[str, str]]:
         for path in (ROOT / folder).glob('*.py'):
             for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
                 maker = isinstance(call, ast.Call) and getattr(call.func, 'attr', '')
-                if (
-                    maker in ('create_publisher', 'create_service')
-                    and path.name not in BESIDE + ELSEWHERE
-                ):
+                if maker in ('create_publisher', 'create_service') and path.name not in BESIDE:
                     kind, name = (ast.unparse(argument) for argument in call.args[:2])
                     topic = eval(name, {'ros': ros, **vars(ros)})
                     found.add((topic.lstrip('/'), kind))
