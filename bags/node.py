@@ -3,18 +3,21 @@
 import platform
 import time
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from bags.decode import message_class
 from bags.errors import BagError
+from bags.message_class import message_class
 from bags.message_text import schema_text
+from bags.parameters import ParameterCollector
 from bags.qos import OfferedQos
 from bags.sequences import SequenceCounter
 from bags.writer import BagWriter
@@ -24,6 +27,7 @@ from tissue_sim.ros import (
     DIAGNOSTICS,
     EVENTS,
     FORCE,
+    FRAME_INPUTS,
     LATCHED,
     MESH,
     MESH_UPDATES,
@@ -35,8 +39,9 @@ from tissue_sim.ros import (
     polled,
     run,
 )
+from tissue_sim.share import share_folder
 
-FORMAT_VERSION = '1'
+FORMAT_VERSION = '2'
 """Version of what our bags hold beyond rosbag2's own format; grows when a reader must know."""
 
 _POLL = 0.004
@@ -50,6 +55,7 @@ _CONFIGURED = {
     MESH: LATCHED,
     MESH_UPDATES: UPDATES,
     FORCE: STREAM,
+    FRAME_INPUTS: STREAM,
     CONTACT: STREAM,
     DIAGNOSTICS: EVENTS,
     f'{ARM}/measured_cp': STREAM,
@@ -59,6 +65,31 @@ _CONFIGURED = {
     f'{ARM}/operating_state': LATCHED,
 }
 """Depths of our publishers: the graph tells every other part of a QoS, but not its history."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """What became of the messages of one topic.
+
+    Attributes:
+        received: that came.
+        written: that are on disk.
+        lost: on the way, by their sequence numbers, or refused by the disk.
+        unheard: sent before the recorder knew the topic.
+    """
+
+    received: int
+    written: int
+    lost: int
+    unheard: int
+
+    @property
+    def sentence(self) -> str:
+        """For the user."""
+        parts = [f'{self.received} received', f'{self.written} written', f'{self.lost} lost']
+        if self.unheard:
+            parts.append(f'{self.unheard} sent before it was heard')
+        return ', '.join(parts)
 
 
 class _Stream:
@@ -92,6 +123,7 @@ class Recorder(Node):
         self._streams: dict[str, _Stream] = {}
         self._unrecorded: dict[str, str] = {}
         self._closed = False
+        self._collector = ParameterCollector(self)
         self._depths = {
             self.resolve_topic_name(name): profile.depth for name, profile in _CONFIGURED.items()
         }
@@ -104,7 +136,9 @@ class Recorder(Node):
                 self._start(topic, types[0])
 
     def review(self) -> None:
-        """Looks at the publishers of recorded topics anew."""
+        """Looks at the nodes, and at the publishers of recorded topics, anew."""
+        self._collector.look()
+        self.writer.describe(parameters=self._collector.text)
         for stream in self._streams.values():
             publishers = self.get_publishers_info_by_topic(stream.topic)
             weaker = [p.node_name for p in publishers if not _compatible(p.qos_profile, stream.qos)]
@@ -134,25 +168,34 @@ class Recorder(Node):
             return
         self._closed = True
         self.drain()
+        self.writer.describe(parameters=self._collector.text)
         self.writer.close()
-        lost, before = self._lost()
+        accounts = self.accounts()
         tally = self.writer.tally
         print(
             f'recorded: {tally.messages} messages, {len(tally.counts)} topics, '
-            f'{sum(lost.values())} lost, {self.writer.folder}',
+            f'{sum(account.lost for account in accounts.values())} lost, {self.writer.folder}',
             flush=True,
         )
-        for topic, count in lost.items():
-            print(f'  lost: {count} of {topic}', flush=True)
-        for topic, count in before.items():
-            print(
-                f'  not heard: the first {count} of {topic}, sent before the recorder knew',
-                flush=True,
-            )
+        for topic, account in accounts.items():
+            print(f'  {topic}: {account.sentence}', flush=True)
         for topic, reason in self._unrecorded.items():
             print(f'  not recorded: {topic}: {reason}', flush=True)
         if self.writer.failure:
             print(f'  {self.writer.failure}', flush=True)
+
+    def accounts(self) -> dict[str, Account]:
+        """What became of the messages of each topic so far."""
+        written, refused = self.writer.tally.counts, self.writer.lost
+        return {
+            topic: Account(
+                received=stream.counter.received,
+                written=written.get(topic, 0),
+                lost=stream.counter.lost + refused.get(topic, 0),
+                unheard=stream.counter.before,
+            )
+            for topic, stream in self._streams.items()
+        }
 
     def _start(self, topic: str, type_name: str) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
@@ -177,27 +220,19 @@ class Recorder(Node):
         self._unrecorded[topic] = reason
         self.get_logger().warning(f'not recorded: {topic}: {reason}')
 
-    def _lost(self) -> tuple[dict[str, int], dict[str, int]]:
-        """By topic: messages lost on the way or by the disk; those sent before the first heard."""
-        refused = self.writer.lost
-        lost = {t: s.counter.lost + refused.get(t, 0) for t, s in self._streams.items()}
-        before = {t: s.counter.before for t, s in self._streams.items()}
-        return {t: n for t, n in lost.items() if n}, {t: n for t, n in before.items() if n}
-
     def _collect(self) -> tuple[bytes, str, dict[str, object]]:
-        lost, before = self._lost()
-        values: dict[str, object] = {
-            'received': sum(stream.counter.received for stream in self._streams.values()),
-            'written': self.writer.tally.messages,
-            'lost': sum(lost.values()),
-            'bytes': self.writer.size,
+        accounts = self.accounts()
+        totals = {
+            word: sum(getattr(account, word) for account in accounts.values())
+            for word in ('received', 'written', 'lost')
         }
-        values |= {f'lost {topic}': count for topic, count in lost.items()}
-        values |= {f'not heard {topic}': count for topic, count in before.items()}
+        values: dict[str, object] = {**totals, 'bytes': self.writer.size}
+        for topic, account in accounts.items():
+            values |= {f'{word} {topic}': count for word, count in asdict(account).items()}
         values |= {f'not recorded {topic}': reason for topic, reason in self._unrecorded.items()}
         if self.writer.failure:
             return DiagnosticStatus.ERROR, self.writer.failure, values
-        if lost or self._unrecorded:
+        if totals['lost'] or self._unrecorded:
             return DiagnosticStatus.WARN, 'the bag is not whole', values
         return DiagnosticStatus.OK, 'recording', values
 
@@ -229,6 +264,9 @@ def _custom_data(scene: str, seed: int) -> dict[str, str]:
         'seed': str(seed),
         'python_version': platform.python_version(),
     }
+    manifest = share_folder() / 'package.xml'
+    if manifest.is_file():
+        data['trainer_version'] = ElementTree.parse(manifest).findtext('version', '')
     for package in ('ros-jazzy-rclpy', 'rclpy', 'numpy', 'numba', 'mcap'):
         try:
             data[f'{package}_version'] = version(package)

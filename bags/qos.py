@@ -6,6 +6,7 @@ the channel's messages without a word, so there is no other way here to write ei
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import yaml
 
@@ -39,6 +40,8 @@ class OfferedQos:
     liveliness_lease_duration: int = INFINITE
 
 
+_WORDS = ('history', 'depth', 'reliability', 'durability', 'liveliness')
+_DURATIONS = ('deadline', 'lifespan', 'liveliness_lease_duration')
 Profiles = Sequence[OfferedQos]
 
 
@@ -64,6 +67,20 @@ def channel_profiles(profiles: Profiles) -> str:
     """The same list as YAML text, for `offered_qos_profiles` in the metadata of an MCAP channel."""
     text: str = yaml.safe_dump(metadata_profiles(profiles), sort_keys=False)
     return text
+
+
+def profiles_from(text: str) -> list[OfferedQos]:
+    """What `channel_profiles` made a text of; depths and names as they are."""
+    found = []
+    for profile in yaml.safe_load(text) or []:
+        values: dict[str, Any] = {name: profile[name] for name in _WORDS}
+        values |= {name: _nanoseconds(profile[name]) for name in _DURATIONS}
+        found.append(OfferedQos(**values))
+    return found
+
+
+def _nanoseconds(duration: dict[str, int]) -> int:
+    return duration['sec'] * NANOSECONDS + duration['nsec']
 
 
 def _seconds(duration: int) -> dict[str, int]:

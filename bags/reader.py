@@ -2,10 +2,10 @@
 
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import SEEK_END, BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -14,8 +14,10 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
+from bags.cdr import Decoder
 from bags.errors import BagError
 from bags.metadata import read_metadata
+from bags.qos import OfferedQos, profiles_from
 
 _MAGIC = b'\x89MCAP0\r\n'
 _RECORD_HEAD = struct.Struct('<BQ')
@@ -57,7 +59,9 @@ class Bag:
         self.path = path
         self.custom_data = custom_data
         self._topics: dict[str, str] = {}
+        self._profiles: dict[str, str] = {}
         self.schemas: dict[str, str] = {}
+        self._decoder = Decoder(self.schemas)
         self.complete = self._read_summary()
         if not self.complete:
             for _ in self._salvage():
@@ -67,15 +71,22 @@ class Bag:
         """Type by topic."""
         return dict(self._topics)
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+    def profiles(self, topic: str) -> list[OfferedQos]:
+        """QoS that the publishers of a topic offered."""
+        return profiles_from(self._profiles.get(topic, ''))
+
+    def messages(
+        self, topics: Collection[str] | None = None, *, since: int = 0
+    ) -> Iterator[Recorded]:
         """Messages in the order of their log times (within a chunk only, where the end is missing).
 
         Args:
             topics: those to read; all by default.
+            since: smallest log time [ns since the epoch].
         """
-        source = self._indexed(topics) if self.complete else self._salvage()
+        source = self._indexed(topics, since) if self.complete else self._salvage()
         for schema, channel, message in source:
-            if topics is None or channel.topic in topics:
+            if (topics is None or channel.topic in topics) and message.log_time >= since:
                 yield Recorded(
                     channel.topic,
                     schema.name,
@@ -85,8 +96,19 @@ class Bag:
                     message.data,
                 )
 
+    def read(self, recorded: Recorded) -> Any:
+        """The message of what was recorded, by the bag's own definition of its type.
+
+        Arrays of numbers are NumPy arrays, all other arrays lists.
+
+        Raises:
+            BagError: the bytes are not such a message.
+        """
+        return self._decoder.decode(recorded.type, recorded.data)
+
     def _know(self, schema: Schema, channel: Channel) -> None:
         self._topics[channel.topic] = schema.name
+        self._profiles[channel.topic] = channel.metadata.get('offered_qos_profiles', '')
         self.schemas[schema.name] = schema.data.decode()
 
     def _read_summary(self) -> bool:
@@ -107,30 +129,21 @@ class Bag:
             self._know(summary.schemas[channel.schema_id], channel)
         return True
 
-    def _indexed(self, topics: Collection[str] | None) -> Iterator[tuple[Schema, Channel, Message]]:
+    def _indexed(
+        self, topics: Collection[str] | None, since: int
+    ) -> Iterator[tuple[Schema, Channel, Message]]:
         with self.path.open('rb') as file:
-            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(
-                topics
-            ):
+            reader = make_reader(file, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(topics, starting_at=since):
                 assert schema is not None
                 yield schema, channel, message
 
     def _salvage(self) -> Iterator[tuple[Schema, Channel, Message]]:
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        for chunk in _complete_chunks(self.path):
-            messages = []
-            for record in breakup_chunk(chunk, validate_crc=True):
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                    self._know(schemas[record.schema_id], record)
-                elif isinstance(record, Message):
-                    messages.append(record)
-            for message in sorted(messages, key=lambda message: message.log_time):
-                channel = channels[message.channel_id]
-                yield schemas[channel.schema_id], channel, message
+        for chunk in salvage(self.path):
+            for channel in chunk.channels:
+                self._know(chunk.schemas[channel.schema_id], channel)
+            for channel, message in sorted(chunk.messages, key=lambda pair: pair[1].log_time):
+                yield chunk.schemas[channel.schema_id], channel, message
 
 
 def open_bag(folder: Path | str) -> Bag:
@@ -146,20 +159,82 @@ def open_bag(folder: Path | str) -> Bag:
     if folder.is_file():
         raise BagError(f'{folder} is a file: name the folder of the bag, {folder.parent}')
     information = read_metadata(folder)
-    names = information.get('relative_file_paths') or []
-    if information.get('storage_identifier') != 'mcap' or len(names) != 1:
-        raise BagError(f'{folder} is not a bag of one MCAP file: its metadata.yaml names {names}')
+    path = mcap_file(folder)
+    return Bag(path, dict(information.get('custom_data') or {}))
+
+
+def mcap_file(folder: Path) -> Path:
+    """The one MCAP file of a bag, by its metadata.yaml or, where there is none, by its ending.
+
+    Raises:
+        BagError: it is not a bag of one MCAP file.
+    """
+    try:
+        information = read_metadata(folder)
+        names = information.get('relative_file_paths') or []
+        storage = information.get('storage_identifier')
+    except BagError:
+        names, storage = [path.name for path in folder.glob('*.mcap')], 'mcap'
+        if not names:
+            raise
+    if storage != 'mcap' or len(names) != 1:
+        raise BagError(f'{folder} is not a bag of one MCAP file: it names {names}')
     path = folder / Path(names[0]).name
     if not path.is_file():
         raise BagError(f'{folder} lacks its file {path.name}')
     with path.open('rb') as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BagError(f'{path} is not an MCAP file')
-    return Bag(path, dict(information.get('custom_data') or {}))
+    return path
 
 
-def _complete_chunks(path: Path) -> Iterator[Chunk]:
-    """Chunks of a file up to the first record that is not all there."""
+@dataclass
+class Salvaged:
+    """One complete chunk of a file.
+
+    Attributes:
+        end: where it ends in the file [bytes].
+        damaged: its checksum does not hold: what was in it is gone.
+        schemas: all known so far, by number.
+        channels: that became known in this chunk.
+        messages: with their channels, in the order of the file.
+        strangers: messages of channels that were in a damaged chunk.
+    """
+
+    end: int
+    damaged: bool = False
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: list[Channel] = field(default_factory=list)
+    messages: list[tuple[Channel, Message]] = field(default_factory=list)
+    strangers: int = 0
+
+
+def salvage(path: Path) -> Iterator[Salvaged]:
+    """Reads chunk by chunk without index or end, up to the first record that is not all there."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for end, body in _complete_chunks(path):
+        chunk = Salvaged(end, schemas=schemas)
+        try:
+            records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
+        except Exception:  # whatever zstd, lz4 or the parser says of bytes that are not their own
+            chunk.damaged = True
+            records = []
+        for record in records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel) and record.id not in channels:
+                channels[record.id] = record
+                chunk.channels.append(record)
+            elif isinstance(record, Message) and record.channel_id in channels:
+                chunk.messages.append((channels[record.channel_id], record))
+            else:
+                chunk.strangers += isinstance(record, Message)
+        yield chunk
+
+
+def _complete_chunks(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Where each chunk of a file ends, and its bytes, up to a record that is not all there."""
     size = path.stat().st_size
     with path.open('rb') as file:
         file.seek(len(_MAGIC))
@@ -169,7 +244,7 @@ def _complete_chunks(path: Path) -> Iterator[Chunk]:
                 return
             body = file.read(length)
             if opcode == Opcode.CHUNK:
-                yield Chunk.read(ReadDataStream(BytesIO(body)))
+                yield file.tell(), body
 
 
 def _record_head(file: BinaryIO) -> tuple[int, int] | None:

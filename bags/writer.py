@@ -88,6 +88,12 @@ class BagWriter:
             {'offered_qos_profiles': channel_profiles(profiles), 'topic_type_hash': type_hash},
         )
 
+    def describe(self, **custom_data: str) -> None:
+        """Puts more into metadata.yaml, at once; nothing happens where it is known already."""
+        if not self._closed and not custom_data.items() <= self._custom_data.items():
+            self._custom_data |= custom_data
+            self._write_metadata()
+
     def write(
         self, topic: str, log_time: int, publish_time: int, data: bytes, sequence: int = 0
     ) -> None:

@@ -50,7 +50,7 @@ class CuttingNode(Node):
             MeshDelta, ros.MESH_UPDATES, self._take_delta, ros.UPDATES
         )
         self._get_mesh = self.create_client(GetMesh, ros.GET_MESH)
-        self.create_service(Cut, ros.CUT, self._serve)
+        ros.introspect(self, self.create_service(Cut, ros.CUT, self._serve))
         self._diagnostics = ros.Diagnostics(self, self._status)
         ros.announce_ready(self)
 

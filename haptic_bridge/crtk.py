@@ -6,7 +6,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Joy
 
 from haptic_bridge.operating_state import OperatingStateMachine, State, crtk_types
-from tissue_sim.ros import EVENTS, LATCHED
+from tissue_sim.ros import EVENTS, LATCHED, introspect
 
 
 class StateInterface:
@@ -29,6 +29,7 @@ class StateInterface:
             types.command, f'{name}/state_command', self._command, EVENTS
         )
         self._query = node.create_service(types.query, f'{name}/operating_state', self._answer)
+        introspect(node, self._query)
         self.publish_changes()
 
     def publish_changes(self) -> None:

@@ -81,6 +81,124 @@ def picture(
     Console().print(f'wrote {output or bag / "picture.png"}', highlight=False)
 
 
+@app.command(epilog='Exit status: that of the recorder.')
+def record(
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='New folder for the bag (default: as of demo).'),
+    ] = None,
+    scene: Annotated[
+        str, typer.Option(help='Scene that the nodes run: its text goes into the bag.')
+    ] = '',
+    seed: Annotated[int, typer.Option(help='Of the session; goes into the bag.')] = 0,
+    domain: Annotated[str, typer.Option(help='ROS domain (default: ROS_DOMAIN_ID, 0).')] = '',
+) -> None:
+    """Record every topic of a graph that runs elsewhere, until Ctrl-C."""
+    from session.record import run_recorder
+
+    run_recorder(output, scene, seed, domain)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def repair(bag: Annotated[Path, typer.Argument(help='Folder of the bag.')]) -> None:
+    """Make a bag that was cut off readable again, and say what is gone."""
+    from session.repair import repair as mend
+
+    mend(bag)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def replay(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    as_recorded: Annotated[
+        bool,
+        typer.Option(
+            '--as-recorded',
+            help='Show mesh and forces as they were; without it the recorded hand drives the '
+            'simulation afresh.',
+        ),
+    ] = False,
+    rate: Annotated[
+        float, typer.Option(min=0.01, max=100.0, help='Seconds of the session in one second.')
+    ] = 1.0,
+    start: Annotated[float, typer.Option(min=0.0, help='Where to begin [s].')] = 0.0,
+    loop: Annotated[bool, typer.Option('--loop', help='Begin again at the end.')] = False,
+    domain: Annotated[
+        str, typer.Option(help='ROS domain, or "free" (default: ROS_DOMAIN_ID, 0).')
+    ] = '',
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='Record the replay into a new bag (not as recorded).'),
+    ] = None,
+    drive_device: Annotated[
+        bool,
+        typer.Option('--drive-device', help='Let the force reach a live device. Without it none.'),
+    ] = False,
+) -> None:
+    """Play a recorded session into the graph. Space pauses, s steps one frame, q ends."""
+    from session.domain import parse_domain
+    from session.replay import ReplayOptions
+    from session.replay import replay as play
+
+    number = parse_domain(domain)
+    options = ReplayOptions(bag, as_recorded, rate, start, loop, number, output, drive_device)
+    raise typer.Exit(int(play(options)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def resimulate(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            '--with',
+            help='key=value of the scene that is to be otherwise; may be given again. Then the '
+            'recorded hand meets the changed tissue, and the differences are shown.',
+        ),
+    ] = None,
+) -> None:
+    """Compute a recorded session again: identical, or where it first differs. Needs no ROS."""
+    from session.recorded_scene import parse_changes
+    from session.resimulate import resimulate as compute
+
+    raise typer.Exit(int(compute(bag, parse_changes(changes or []))))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def report(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='Page to write (default: BAG/report.html).'),
+    ] = None,
+) -> None:
+    """Write a recorded session on one page: force, depth, speed, the cut against the plan."""
+    from session.html_report import write_report
+
+    write_report(bag, output or bag / 'report.html')
+    Console().print(f'wrote {output or bag / "report.html"}', highlight=False)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def export(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag.')],
+    output: Annotated[
+        Path,
+        typer.Argument(
+            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), or a folder for CSV.'
+        ),
+    ],
+    at: Annotated[
+        float | None, typer.Option(min=0.0, help='Moment of the mesh [s] (default: the end).')
+    ] = None,
+) -> None:
+    """Write a bag's poses and forces as CSV, or its tissue as a mesh."""
+    from session.export import export as write
+
+    for file in write(bag, output, at):
+        Console().print(f'wrote {file}', highlight=False)
+
+
 @app.command('compare-cuts', epilog=EXIT_STATUSES)
 def compare_cuts(
     output: Annotated[

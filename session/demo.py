@@ -61,7 +61,7 @@ def run_demo(options: DemoOptions) -> Status:
     """
     scene = load_scene(options.scene)
     seconds = _duration(scene, options.seconds)
-    bag = _new_bag(options.bag, scene.name)
+    bag = new_bag(options.bag, scene.name)
     nodes = session_nodes(scene.path, bag, options.seed, seconds)
     console, notes = Console(), Console(stderr=True)
     with reserved_domain(options.domain) as domain:
@@ -109,8 +109,16 @@ def _duration(scene: Scene, asked: float | None) -> float:
     return seconds
 
 
-def _new_bag(asked: Path | None, scene: str) -> Path:
-    """Where the recorder will make the bag, refused where it could not."""
+def new_bag(asked: Path | None, scene: str) -> Path:
+    """Where the recorder will make the bag, refused where it could not.
+
+    Args:
+        asked: what the user wants; None: one in `SESSIONS`.
+        scene: that the latter is named after.
+
+    Raises:
+        SessionError: it exists already, or cannot be made.
+    """
     if asked == Path():
         raise SessionError('--bag names no folder: give the path of a new one')
     if asked is None:

@@ -3,16 +3,17 @@
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.reader import Recorded, open_bag
+from bags.reader import open_bag
 from bags.sequences import SequenceCounter
+from bags.topics import CONTACT, DIAGNOSTICS, SERVO_CF, of_session
 from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
 from session.graph import MODULES
 
-CONTACT, SERVO_CF, DIAGNOSTICS = '/tool/contact', '/arm/servo_cf', '/diagnostics'
 SHARED = (DIAGNOSTICS, '/parameter_events', '/rosout')
 """Topics that every node publishes on: their messages are of several sequences."""
 NANOSECOND = 1e-9
@@ -83,6 +84,7 @@ def read_evidence(folder: Path) -> Evidence:
     state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
     contact_codec, wrench_codec = ContactCodec(), WrenchStampedCodec()
     contacts, forces = [], []
+    servo_cf = of_session(SERVO_CF, bag.topics())
     start = end = 0
     for message in bag.messages():
         start = start or message.log_time
@@ -93,10 +95,10 @@ def read_evidence(folder: Path) -> Evidence:
         evidence.messages[message.topic] = evidence.messages.get(message.topic, 0) + 1
         if message.topic == CONTACT:
             contacts.append((time, contact_codec.decode(message.data).values[state][0] != 0))
-        elif message.topic == SERVO_CF:
+        elif message.topic == servo_cf:
             forces.append((time, np.linalg.norm(wrench_codec.decode(message.data).values[force])))
         elif message.topic == DIAGNOSTICS:
-            evidence.statuses += _statuses(message, time)
+            evidence.statuses += _statuses(bag.read(message), time)
     evidence.duration = (end - start) * NANOSECOND
     evidence.contacts = np.array(contacts, float).reshape(-1, 2)
     evidence.forces = np.array(forces, float).reshape(-1, 2)
@@ -109,16 +111,14 @@ def _count_publishers(topic: str) -> int:
     return len(MODULES) if topic in SHARED else 1
 
 
-def _statuses(message: Recorded, time: float) -> list[Status]:
-    from bags.decode import decode  # needs ROS, which the rest of this module does not
-
+def _statuses(array: Any, time: float) -> list[Status]:
     return [
         Status(
             time,
             status.name,
-            status.level[0],
+            status.level,
             status.message,
             {value.key: value.value for value in status.values},
         )
-        for status in decode(message).status
+        for status in array.status
     ]

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from session.node_process import NodeCommand
@@ -35,16 +36,40 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
     own: dict[str, dict[str, object]] = {
         ARM_NODE: {'seconds': float(seconds)},
         BRIDGE_NODE: {'auto_enable': True},
-        RECORDER_NODE: {'bag': str(bag)},
     }
-    commands = []
-    for name, module in MODULES.items():
-        parameters = {'scene': str(scene), 'seed': seed, **own.get(name, {})}
-        argv = _argv(module, parameters)
-        records = name == RECORDER_NODE
-        grace = CLOSING_A_BAG if records else NodeCommand.grace
-        commands.append(NodeCommand(name, argv, records=records, grace=grace))
-    return commands
+    common = {'scene': str(scene), 'seed': seed}
+    commands = [
+        node_command(name, common | own.get(name, {})) for name in MODULES if name != RECORDER_NODE
+    ]
+    return [*commands, recorder_command(scene, bag, seed)]
+
+
+def node_command(
+    name: str, parameters: Mapping[str, object], remapped: Mapping[str, str] | None = None
+) -> NodeCommand:
+    """A node to run.
+
+    Args:
+        name: one of `MODULES`.
+        parameters: by name.
+        remapped: topics and services by the names that the node's code gives them.
+    """
+    renamed = [f'{before}:={after}' for before, after in (remapped or {}).items()]
+    argv = _argv(MODULES[name], parameters) + tuple(x for rule in renamed for x in ('-r', rule))
+    return NodeCommand(name, argv)
+
+
+def recorder_command(scene: Path | None, bag: Path, seed: int) -> NodeCommand:
+    """The recorder, which is ended last and has time to close its bag.
+
+    Args:
+        scene: file of which the text goes into the bag; None: not known.
+        bag: folder of the new bag.
+        seed: goes into the bag.
+    """
+    parameters = {'scene': str(scene or ''), 'seed': seed, 'bag': str(bag)}
+    command = node_command(RECORDER_NODE, parameters)
+    return replace(command, records=True, grace=CLOSING_A_BAG)
 
 
 def discovery(environ: Mapping[str, str]) -> dict[str, str]:
@@ -70,7 +95,7 @@ def arm_command(scene: Path, **parameters: object) -> NodeCommand:
     return NodeCommand(ARM_NODE, _argv(MODULES[ARM_NODE], values))
 
 
-def _argv(module: str, parameters: dict[str, object]) -> tuple[str, ...]:
+def _argv(module: str, parameters: Mapping[str, object]) -> tuple[str, ...]:
     # What a node says goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
     argv = [sys.executable, '-m', module, '--ros-args', '--disable-external-lib-logs']
     for key, value in parameters.items():

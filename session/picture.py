@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from bags.decode import decode
-from bags.reader import Recorded, open_bag
+from bags.reader import open_bag
+from bags.tissue import follow
+from bags.topics import CONTACT, MESH, SERVO_CF, UPDATES, of_session
 from haptic_bridge.chain import INSIDE, NONE
 from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
 from session.errors import SessionError
@@ -20,13 +21,11 @@ from tissue_sim.replica import MeshReplica
 
 Floats = NDArray[np.float64]
 
-MESH, UPDATES = '/tissue/mesh', '/tissue/mesh_updates'
-CONTACT, SERVO_CF = '/tool/contact', '/arm/servo_cf'
 FORMATS = ('.png', '.svg', '.pdf')
 
 _TISSUE, _CUT = np.array([0.86, 0.50, 0.42]), np.array([0.62, 0.04, 0.08])
 _PATH, _BLADE, _FORCE = '#8a8a8a', '#1f4e8c', '#1f4e8c'
-_STYLE: Any = {
+STYLE: Any = {
     'grid.color': '#e4e4e4',
     'grid.linewidth': 0.5,
     'svg.hashsalt': 'equal bags, equal files',
@@ -71,7 +70,7 @@ def make_picture(bag: Path, file: Path, at: float | None) -> None:
     if not file.parent.is_dir():
         raise SessionError(f'{file.parent} does not exist: make it first, the picture goes into it')
     story = read_story(bag, at)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         draw(story).savefig(file, dpi=130)
 
 
@@ -88,17 +87,19 @@ def read_story(bag: Path, at: float | None) -> Story:
     places = [ContactCodec.fields[name] for name in ('device', 'blade_root', 'blade_tip')]
     tool, forces = [], []
     start, time = 0, 0.0
-    for message in open_bag(bag).messages():
+    opened = open_bag(bag)
+    servo_cf = of_session(SERVO_CF, opened.topics())
+    for message in opened.messages():
         start = start or message.log_time
         time = (message.log_time - start) * 1e-9
         if message.topic == CONTACT:
             values = contacts.decode(message.data).values
             tool.append([time, *(x for place in places for x in values[place]), *values[state]])
-        elif message.topic == SERVO_CF:
+        elif message.topic == servo_cf:
             norm = np.linalg.norm(wrenches.decode(message.data).values[force])
             forces.append([time, float(norm)])
         elif message.topic in (MESH, UPDATES) and (at is None or time <= at):
-            _follow(story.replica, message)
+            follow(story.replica, message.topic, opened.read(message))
     story.moment = time if at is None else min(at, time)
     if story.replica.revision < 0:
         until = '' if at is None else f' in its first {at:g} s'
@@ -106,14 +107,6 @@ def read_story(bag: Path, at: float | None) -> Story:
     story.tool = np.array(tool, float).reshape(-1, 11)
     story.forces = np.array(forces, float).reshape(-1, 2)
     return story
-
-
-def _follow(replica: MeshReplica, message: Recorded) -> None:
-    content: Any = decode(message)
-    if message.topic == UPDATES:
-        replica.apply(content)  # after a gap nothing fits until the next keyframe
-    elif content.revision > replica.revision:
-        replica.load(content)
 
 
 def draw(story: Story) -> Figure:
@@ -124,12 +117,13 @@ def draw(story: Story) -> Figure:
         height_ratios=[3.2, 1],
         per_subplot_kw={'tissue': {'projection': '3d', 'computed_zorder': False}},
     ).values()
-    _draw_tissue(above, story)
+    draw_tissue(above, story)
     _draw_force(below, story)
     return figure
 
 
-def _draw_tissue(axes: Any, story: Story) -> None:
+def draw_tissue(axes: Any, story: Story) -> None:
+    """Draws the tissue, and the tool where the story has it, in axes of three dimensions."""
     replica = story.replica
     corners = replica.positions()[replica.triangles] * _MILLIMETRES
     _draw_surface(axes, corners, replica.triangle_kind == 1)
@@ -184,8 +178,8 @@ def _draw_surface(axes: Any, corners: Floats, cut: NDArray[np.bool_]) -> None:
 def _draw_force(axes: Any, story: Story) -> None:
     top = 1.25 * max(float(story.forces[:, 1].max(initial=0.0)), 0.1)
     for state, colour, name in ((INSIDE, '#e8b4b0', 'cut'), (None, '#dddddd', 'contact')):
-        spans = _spans(story.tool, state)
-        boxes = [[(a, 0), (b, 0), (b, top), (a, top)] for a, b in spans]
+        held = spans(story.tool, state)
+        boxes = [[(a, 0), (b, 0), (b, top), (a, top)] for a, b in held]
         axes.add_collection(PolyCollection(boxes, facecolors=colour, label=name))
     axes.plot(*story.forces.T, color=_FORCE, lw=0.8, label='force on the hand')
     axes.axvline(story.moment, color='black', lw=0.8, ls=':', label='moment above')
@@ -194,7 +188,7 @@ def _draw_force(axes: Any, story: Story) -> None:
     axes.legend(loc='upper left', frameon=False, fontsize=8, ncols=4)
 
 
-def _spans(tool: Floats, state: int | None) -> Floats:
+def spans(tool: Floats, state: int | None) -> Floats:
     """Begin and end [s] of each stretch in a contact state, or (None) in contact otherwise."""
     held = tool[:, 10]
     chosen = held == state if state is not None else (held != NONE) & (held != INSIDE)

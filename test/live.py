@@ -214,12 +214,13 @@ class Recording:
     """A bag in memory. Times are [s] by the stamp in the header, since the first message.
 
     Attributes:
+        bag: to read messages with.
         complete: whether the bag was closed in order.
         start: when the first message was recorded [ns since the epoch].
     """
 
     def __init__(self, folder: Path) -> None:
-        bag = open_bag(folder)
+        self.bag = bag = open_bag(folder)
         self.complete = bag.complete
         self._messages: dict[str, list[Recorded]] = {topic: [] for topic in bag.topics()}
         self.start = 0

@@ -4,6 +4,7 @@ import itertools
 import os
 import random
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 import rclpy
+import yaml
 from cutting_trainer_msgs.msg import Contact, MeshDelta
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
@@ -26,8 +28,8 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from bags.decode import decode
 from bags.reader import open_bag
+from bags.repair import repair_bag
 from tissue_sim.ros import CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
 
 ROOT = Path(__file__).parents[1]
@@ -131,6 +133,11 @@ def recorded(folder: Path, topic: str) -> list[bytes]:
         return [bytes(data) for _, _, data in reader.messages(chosen)]
 
 
+def read_topic(folder: Path, topic: str) -> list[Any]:
+    bag = open_bag(folder)
+    return [bag.read(message) for message in bag.messages([topic])]
+
+
 def test_every_message_of_a_1_khz_stream_is_in_the_bag_byte_for_byte(
     node: Node, recorder: RecorderProcess
 ) -> None:
@@ -139,7 +146,8 @@ def test_every_message_of_a_1_khz_stream_is_in_the_bag_byte_for_byte(
     time.sleep(0.3)
     said = recorder.end()
     assert recorder.process.returncode == 0
-    assert re.fullmatch(rf'recorded: \d+ messages, \d+ topics, 0 lost, {recorder.folder}\n', said)
+    assert re.match(rf'recorded: \d+ messages, \d+ topics, 0 lost, {recorder.folder}\n', said)
+    assert '  /stream: 2000 received, 2000 written, 0 lost\n' in said
     assert recorded(recorder.folder, '/stream') == sent
     bag = open_bag(recorder.folder)
     assert bag.complete
@@ -193,8 +201,8 @@ def test_a_latched_message_from_before_the_recorder_is_in_the_bag(
     wait_for(lambda: publisher.get_subscription_count() == 1, 'the recorder')
     time.sleep(0.5)
     recorder.end()
-    (message,) = open_bag(recorder.folder).messages(['/latched'])
-    assert decode(message).data == 'from before'
+    (message,) = read_topic(recorder.folder, '/latched')
+    assert message.data == 'from before'
 
 
 def test_a_best_effort_publisher_is_recorded_with_the_qos_it_offers(
@@ -230,10 +238,8 @@ def test_service_calls_are_recorded_where_introspection_is_on(
     wait_for(future.done, 'the service')
     time.sleep(0.3)
     recorder.end()
-    events = [decode(m) for m in open_bag(recorder.folder).messages(['/do_it/_service_event'])]
-    assert [list(event.request) for event in events if event.request] == [
-        [SetBool.Request(data=True)]
-    ]
+    events = read_topic(recorder.folder, '/do_it/_service_event')
+    assert [event.request[0].data for event in events if event.request] == [True]
     assert [event.response[0].message for event in events if event.response] == ['cut']
     assert len(recorded(recorder.folder, '/do_it/_service_event')) == len(events) == 2
 
@@ -265,21 +271,47 @@ def test_what_a_publisher_sent_before_the_recorder_heard_it_is_said(
     time.sleep(0.2)
     publisher.publish(String(data='heard'))
     time.sleep(0.3)
-    assert 'not heard: the first 3 of /early' in recorder.end()
+    assert '/early: 1 received, 1 written, 0 lost, 3 sent before' in recorder.end()
 
 
-def test_losses_are_on_diagnostics_and_diagnostics_are_in_the_bag(
+def test_losses_are_on_diagnostics_and_they_and_all_parameters_are_in_the_bag(
     recorder: RecorderProcess,
 ) -> None:
     time.sleep(2.5)
     recorder.end()
-    arrays = [decode(m) for m in open_bag(recorder.folder).messages(['/diagnostics'])]
+    parameters = yaml.safe_load(open_bag(recorder.folder).custom_data['parameters'])
+    assert parameters['/recorder']['seed'] == 11
+    arrays = read_topic(recorder.folder, '/diagnostics')
     status = arrays[-1].status[0]
     values = {pair.key: pair.value for pair in status.values}
     assert status.name == 'recorder'
     assert int(values['received']) >= int(values['written']) > 0
     assert values['lost'] == '0'
+    assert int(values['received /diagnostics']) >= int(values['written /diagnostics']) > 0
     assert int(values['bytes']) > 0
+
+
+def test_a_full_disk_does_not_end_the_recorder_and_the_loss_is_counted_and_said(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    publisher = heard(node, PoseStamped, '/stream', QoSProfile(depth=1000))
+    sent = publish_at_1_khz(publisher, poses(300))
+    time.sleep(0.5)
+    path = recorder.folder / 'bag_0.mcap'
+    limit = path.stat().st_size + 100
+    resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+    sent += publish_at_1_khz(publisher, poses(700))
+    time.sleep(1.5)
+    assert recorder.process.poll() is None
+    said = recorder.end()
+    assert recorder.process.returncode == 0
+    written, lost = map(
+        int, re.search(r'/stream: 1000 received, (\d+) written, (\d+) lost', said).groups()
+    )
+    assert written + lost == 1000 and lost > 0
+    assert f'cannot write {path}: File too large' in said
+    assert repair_bag(recorder.folder).messages > 0
+    assert recorded(recorder.folder, '/stream') == sent[:written]
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def rows(page: Path, pattern: str) -> set[tuple[str, str]]:
     return found
 
 
-BESIDE = ('crtk.py', 'probe_node.py', 'omni_node.py')
+BESIDE = ('crtk.py', 'probe_node.py', 'omni_node.py', 'player_node.py')
 """Modules whose topics carry a device's name, or another's messages, or are counted below."""
 
 

@@ -36,7 +36,6 @@ from live import (
 )
 from rosbags.highlevel import AnyReader
 
-from bags.decode import decode
 from haptic_bridge.node import FOLLOW_PERIOD
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec, WrenchStampedCodec
@@ -219,7 +218,7 @@ def test_force_fades_and_comes_back_when_the_tissue_is_frozen_and_goes_on(
     steps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
     assert (steps <= PROFILE.max_slew * np.clip(np.diff(times), 1e-4, 5e-3) + 1e-3).all()
     states = recording.messages('/haptic_bridge/operating_state')
-    assert 'FAULT' not in [decode(message).state for message in states]
+    assert 'FAULT' not in [recording.bag.read(message).state for message in states]
     assert 'no frame of the simulation for 100 ms' in session.said
 
 
@@ -241,7 +240,7 @@ def assert_undisturbed(fault: Fault) -> None:
     np.testing.assert_allclose(after, before.mean(), rtol=SAME)
     assert zero_from(times, norms) < times[-1]
     states = fault.recording.messages('/haptic_bridge/operating_state')
-    assert 'FAULT' not in [decode(message).state for message in states]
+    assert 'FAULT' not in [fault.recording.bag.read(message).state for message in states]
 
 
 def end(witness: 'subprocess.Popen[str]') -> None:

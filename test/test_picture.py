@@ -99,8 +99,8 @@ def test_lost_delta_is_healed_by_the_next_keyframe(bag: Path) -> None:
 def test_force_and_contact_are_shown_to_the_end_whatever_the_moment(bag: Path) -> None:
     story = read_story(bag, 0.1)
     np.testing.assert_allclose(story.forces[:, 1], [0, 1, 1, 2, 0])
-    np.testing.assert_allclose(picture._spans(story.tool, None), [[0.5, 1.5]])
-    np.testing.assert_allclose(picture._spans(story.tool, 2), [[1.5, 2.0]])
+    np.testing.assert_allclose(picture.spans(story.tool, None), [[0.5, 1.5]])
+    np.testing.assert_allclose(picture.spans(story.tool, 2), [[1.5, 2.0]])
 
 
 @pytest.mark.parametrize('ending', picture.FORMATS)

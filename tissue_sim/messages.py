@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from cutting_trainer_msgs.msg import Contact, ForceSample, Mesh, MeshDelta
+from cutting_trainer_msgs.msg import Contact, ForceSample, FrameInputs, Mesh, MeshDelta
 from cutting_trainer_msgs.srv import Cut
 
-from tissue_sim.contact import Frame, State, ToolContact
+from tissue_sim.contact import Frame
 from tissue_sim.mesh import TetMesh, TopologyDelta, Touched
 from tissue_sim.replica import state_hash
 from tissue_sim.ros import FRAME
@@ -132,50 +132,28 @@ def force_message(
     return message
 
 
-def tool_contact(message: Contact, node_count: int) -> ToolContact:
-    """A contact for the core.
+def inputs_message(
+    frame: Frame, contact: Contact | None, answer: int, cut_step: int, time_ns: int
+) -> FrameInputs:
+    """What a frame was computed from as a message.
 
     Args:
-        message: as received, from anybody.
-        node_count: of the mesh.
-
-    Raises:
-        ValueError: one sentence that says which field is wrong.
+        frame: what came of it.
+        contact: the one it was given, or None.
+        answer: what came of the cut asked for last, see `FrameInputs.msg`.
+        cut_step: frame that had asked for it.
+        time_ns: stamp [ns].
     """
-    if message.state > Contact.INSIDE:
-        raise ValueError(f'state {message.state} is none of 0, 1, 2')
-    for name in ('weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip'):
-        values = getattr(message, name)
-        if not np.isfinite(values).all() or np.abs(values).max() > 10:
-            raise ValueError(f'{name} {values.tolist()} is not finite or beyond 10')
-    if not 0 <= message.coupling_stiffness <= 1e5:
-        raise ValueError(f'coupling_stiffness {message.coupling_stiffness} is not in 0 to 1e5 N/m')
-    if not 0 <= message.proxy_radius <= 0.1:
-        raise ValueError(f'proxy_radius {message.proxy_radius} is not in 0 to 0.1 m')
-    if message.state == Contact.TOUCHING:
-        if message.nodes.max() >= node_count:
-            raise ValueError(f'nodes {message.nodes.tolist()} go beyond the {node_count} nodes')
-        if abs(message.weights.sum() - 1) > 1e-6 or message.weights.min() < -1e-6:
-            raise ValueError(f'weights {message.weights.tolist()} are not barycentric')
-        if abs(np.linalg.norm(message.normal) - 1) > 1e-6:
-            raise ValueError(f'normal {message.normal.tolist()} is not a unit vector')
-    # A node of two touched triangles stands there twice.
-    nodes, slots = np.unique(message.nodes.astype(np.int64), return_inverse=True)
-    weights = np.bincount(slots, message.weights, len(nodes))
-    return ToolContact(
-        state=State(message.state),
-        topology=message.topology,
-        nodes=nodes[weights > 0],
-        weights=weights[weights > 0],
-        device=message.device,
-        offset=message.proxy - message.point,
-        normal=message.normal,
-        stiffness=message.coupling_stiffness,
-        radius=message.proxy_radius,
-        blade_root=message.blade_root,
-        blade_tip=message.blade_tip,
-        sequence=message.sequence,
-    )
+    message = FrameInputs(step=frame.step, answer=answer, diverged=frame.diverged)
+    message.header.frame_id = FRAME
+    message.header.stamp = stamp(time_ns)
+    if contact is not None:
+        message.has_contact = True
+        message.contact_sequence = contact.sequence
+        message.contact_stamp = contact.header.stamp
+    if answer != FrameInputs.NO_ANSWER:
+        message.cut_step = cut_step
+    return message
 
 
 def delta_into(message: Any, delta: TopologyDelta) -> None:

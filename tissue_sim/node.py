@@ -6,58 +6,25 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from cutting_trainer_msgs.msg import Contact, ForceSample, Mesh, MeshDelta
+from cutting_trainer_msgs.msg import Contact, ForceSample, FrameInputs, Mesh, MeshDelta
 from cutting_trainer_msgs.srv import Cut, GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from tissue_sim import messages, ros
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.blade import Resistance
+from tissue_sim.assembly import make_simulation
 from tissue_sim.contact import Command, Frame, ToolContact
-from tissue_sim.dynamics import TimeStepping
 from tissue_sim.errors import MeshError
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, Touched
-from tissue_sim.mesh_io import load_tissue
+from tissue_sim.mesh import Touched
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
-from tissue_sim.simulation import TissueSimulation
 from tissue_sim.timing import PeriodicLoop
+from tissue_sim.tool_contact import tool_contact
 from tissue_sim.warm_up import warm_up
 
 _CONTACT_AGE_NS = 100_000_000
 _KEYFRAME_SECONDS = 5.0
 _CUT_TIMEOUT_NS = 1_000_000_000
-
-
-def make_simulation(settings: TissueSettings) -> TissueSimulation:
-    """The simulation that a scene describes.
-
-    Args:
-        settings: its section `tissue`.
-
-    Raises:
-        MeshError: the mesh cannot be used.
-    """
-    nodes, tetrahedra, fixed = load_tissue(settings)
-    m, d = settings.material, settings.damping
-    return TissueSimulation(
-        TetMesh(nodes, tetrahedra, fixed),
-        Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
-        Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
-        model=settings.model,
-        stepping=TimeStepping(
-            settings.integrator,
-            rate=settings.integration.rate,
-            safety=settings.integration.safety,
-            min_substeps=settings.integration.min_substeps,
-            max_substeps=settings.integration.max_substeps,
-            frequency_growth=settings.integration.frequency_growth,
-        ),
-        active=ActiveSettings(**settings.active_region.model_dump()),
-        stretch=settings.stretch,
-    )
 
 
 class TissueSimNode(Node):
@@ -80,6 +47,7 @@ class TissueSimNode(Node):
         self._cut: Any = None
         self._cut_sent = 0
         self._cut_step = 0
+        self._answer = FrameInputs.NO_ANSWER
         self._next_keyframe = 0.0
         self._frame: Frame | None = None
         self._connect()
@@ -88,9 +56,11 @@ class TissueSimNode(Node):
         self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, ros.LATCHED)
         self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
         self._forces = self.create_publisher(ForceSample, ros.FORCE, ros.STREAM)
+        self._inputs = self.create_publisher(FrameInputs, ros.FRAME_INPUTS, ros.STREAM)
         self._contacts = ros.polled(self, Contact, ros.CONTACT, ros.NEWEST_BEST_EFFORT)
         self._cutting = self.create_client(Cut, ros.CUT)
-        self.create_service(GetMesh, ros.GET_MESH, self._serve_mesh)
+        service = self.create_service(GetMesh, ros.GET_MESH, self._serve_mesh)
+        ros.introspect(self, service, contents=False)  # whole meshes are in the bag as it is
         self._diagnostics = ros.Diagnostics(self, self._status)
 
     def work(self, stop: ros.Stop) -> None:
@@ -110,6 +80,11 @@ class TissueSimNode(Node):
         contact = self._newest_contact()
         frame = self._simulation.frame(contact)
         now = time.time_ns()
+        used = None if contact is None else self._contact
+        self._inputs.publish(
+            messages.inputs_message(frame, used, self._answer, self._cut_step, now)
+        )
+        self._answer = FrameInputs.NO_ANSWER
         delta = self._encoder.encode(
             self._simulation.displacement, frame.step, now, self._touched, self._cut_step
         )
@@ -121,7 +96,7 @@ class TissueSimNode(Node):
                     frame,
                     self._encoder.revision,
                     self._simulation.mesh.topology,
-                    self._contact if contact is not None else None,
+                    used,
                     now,
                 )
             )
@@ -144,7 +119,7 @@ class TissueSimNode(Node):
         if self._contact is None or now - self._contact_received > _CONTACT_AGE_NS:
             return None
         try:
-            return messages.tool_contact(self._contact, self._simulation.mesh.node_count)
+            return tool_contact(self._contact, self._simulation.mesh.node_count)
         except ValueError as error:
             self._reject('contact', str(error))
             return None
@@ -158,16 +133,16 @@ class TissueSimNode(Node):
         if frame.sweep is not None:
             request.root_from, request.tip_from = frame.sweep.root_from, frame.sweep.tip_from
             request.root_to, request.tip_to = frame.sweep.root_to, frame.sweep.tip_to
+        self._cut_step = frame.step
         if not self._cutting.service_is_ready():
             if frame.command == Command.FINISH:
                 self._simulation.cut_done()  # nobody is there who could remember the stroke
+                self._answer = FrameInputs.GIVEN_UP
                 return
-            self._simulation.cut_failed()
-            self._reject('cut', 'the service cutting/cut is not there')
+            self._lose_cut('the service cutting/cut is not there')
             return
         self._cut = self._cutting.call_async(request)
         self._cut_sent = time.monotonic_ns()
-        self._cut_step = frame.step
 
     def _take_answer(self) -> None:
         if self._cut is None:
@@ -176,13 +151,13 @@ class TissueSimNode(Node):
             if time.monotonic_ns() - self._cut_sent > _CUT_TIMEOUT_NS:
                 self._cutting.remove_pending_request(self._cut)
                 self._cut = None
-                self._simulation.cut_failed()
-                self._reject('cut', 'no answer within 1 s')
+                self._lose_cut('no answer within 1 s')
             return
         response, self._cut = self._cut.result(), None
         try:
             if response.error_code == Cut.Response.INVALID_SWEEP:
                 self._simulation.cut_done()
+                self._answer = FrameInputs.REFUSED
                 self._reject('cut', f'{response.error_msg}: this sweep stays uncut')
                 return
             if not response.success:
@@ -192,11 +167,17 @@ class TissueSimNode(Node):
             delta = messages.delta_from(response)
             if delta.empty:
                 self._simulation.cut_done()
+                self._answer = FrameInputs.EMPTY
             else:
                 self._touched = self._simulation.apply_cut(delta)
+                self._answer = FrameInputs.APPLIED
         except (ValueError, MeshError) as error:
-            self._simulation.cut_failed()
-            self._reject('cut', str(error))
+            self._lose_cut(str(error))
+
+    def _lose_cut(self, why: str) -> None:
+        self._simulation.cut_failed()
+        self._answer = FrameInputs.LOST
+        self._reject('cut', why)
 
     def _publish_keyframe(self) -> None:
         self._mesh_publisher.publish(self._mesh_message())

@@ -13,6 +13,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.service_introspection import ServiceIntrospectionState
 
 FRAME = 'tissue'
 
@@ -20,6 +21,7 @@ MESH = 'tissue/mesh'
 MESH_UPDATES = 'tissue/mesh_updates'
 GET_MESH = 'tissue/get_mesh'
 FORCE = 'tissue/force'
+FRAME_INPUTS = 'tissue/frame_inputs'
 CONTACT = 'tool/contact'
 CUT = 'cutting/cut'
 ARM = 'arm'
@@ -83,6 +85,18 @@ def take_numbered(subscription: Any) -> tuple[bytes, int] | None:
     """As `take_raw`, with the number that its publisher gave the message; 0 where it gives none."""
     taken = subscription.handle.take_message(subscription.msg_type, True)
     return None if taken is None else (taken[0], taken[1]['publication_sequence_number'] or 0)
+
+
+def introspect(node: Node, service: Any, *, contents: bool = True) -> None:
+    """Lets a service publish its calls on `<service>/_service_event`, where they are recorded.
+
+    Args:
+        node: whose clock stamps them.
+        service: as `create_service` returned it.
+        contents: with requests and responses; without, only that and when there was a call.
+    """
+    what = ServiceIntrospectionState.CONTENTS if contents else ServiceIntrospectionState.METADATA
+    service.configure_introspection(node.get_clock(), EVENTS, what)
 
 
 class Diagnostics:

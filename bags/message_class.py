@@ -1,12 +1,9 @@
-"""The ROS side of reading a bag: from recorded bytes to message objects."""
+"""The Python classes of messages by the names that the graph gives their types."""
 
 from importlib import import_module
 from typing import Any
 
-from rclpy.serialization import deserialize_message
-
 from bags.errors import BagError
-from bags.reader import Recorded
 
 
 def message_class(type_name: str) -> Any:
@@ -24,8 +21,3 @@ def message_class(type_name: str) -> Any:
             f'the message type {type_name} is not installed: '
             f'build or install {package}, then source it'
         ) from None
-
-
-def decode(recorded: Recorded) -> Any:
-    """The message object of what a bag has."""
-    return deserialize_message(recorded.data, message_class(recorded.type))

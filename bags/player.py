@@ -1,0 +1,135 @@
+"""What is to be published when a bag is played; no ROS and no clock of its own."""
+
+from collections.abc import Collection, Iterator
+
+import numpy as np
+
+from bags.errors import BagError
+from bags.reader import Bag, Recorded
+from bags.topics import MESH, POSE, UPDATES, of_session
+from haptic_bridge.wire import PoseStampedCodec, Sample
+
+STEP = 1 / 30
+"""[s] of the session that one step shows: a frame of the simulation."""
+
+
+class Playhead:
+    """Where in the session a replay is.
+
+    Args:
+        start: [s] from the beginning of the session.
+        end: [s]; with `loop` it goes on from `start` there.
+        rate: seconds of the session in one second.
+        loop: begin again at the end.
+
+    Attributes:
+        paused: it stands still.
+        rounds: how often it has begun again.
+    """
+
+    def __init__(self, start: float, end: float, *, rate: float = 1.0, loop: bool = False) -> None:
+        self.paused = True
+        self.rounds = 0
+        self._start, self._end = start, end
+        self._rate, self._loop = rate, loop
+        self._position = start
+        self._since: float | None = None
+
+    @property
+    def position(self) -> float:
+        """Where it was at the last move [s]."""
+        return self._position
+
+    @property
+    def over(self) -> bool:
+        """Whether the end has been reached for good."""
+        return not self._loop and self._position >= self._end
+
+    def move(self, now: float) -> float:
+        """Goes on to a time of the caller's clock [s]; returns the position [s]."""
+        if not self.paused and self._since is not None:
+            self._position += (now - self._since) * self._rate
+        self._since = now
+        if self._position >= self._end:
+            self.rounds += self._loop
+            self._position = self._start if self._loop else self._end
+        return self._position
+
+    def toggle(self) -> None:
+        """Pauses, or goes on."""
+        self.paused = not self.paused
+
+    def step(self) -> None:
+        """Pauses, one frame further on."""
+        self.paused = True
+        self._position += STEP
+
+
+class RecordedStream:
+    """The recorded messages in their order, for as long as a playhead goes forward.
+
+    Deltas of the mesh are left out until a keyframe has come: whoever listens could not apply them.
+
+    Args:
+        bag: to read.
+        topics: those to play.
+        start: where to begin [s] from the first message of the bag.
+    """
+
+    def __init__(self, bag: Bag, topics: Collection[str], start: float) -> None:
+        self._origin = first_time(bag)
+        since = self._origin + round(start * 1e9)
+        self._messages = bag.messages(topics, since=since if start else 0)
+        self._next = next(self._messages, None)
+        self._has_mesh = False
+
+    def due(self, position: float) -> Iterator[Recorded]:
+        """What lies before a position [s] and has not been given yet."""
+        until = self._origin + round(position * 1e9)
+        while self._next is not None and self._next.log_time <= until:
+            message, self._next = self._next, next(self._messages, None)
+            self._has_mesh |= message.topic == MESH
+            if self._has_mesh or message.topic != UPDATES:
+                yield message
+
+
+class RecordedHand:
+    """The way of the device.
+
+    Args:
+        bag: to read.
+
+    Raises:
+        BagError: it has no poses.
+    """
+
+    def __init__(self, bag: Bag) -> None:
+        codec, origin = PoseStampedCodec(), first_time(bag)
+        recorded = list(bag.messages([of_session(POSE, bag.topics())]))
+        if not recorded:
+            raise BagError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
+        self._times = np.array([(m.log_time - origin) * 1e-9 for m in recorded])
+        self._poses = [codec.decode(m.data) for m in recorded]
+
+    def pose(self, position: float) -> Sample:
+        """The newest pose at a position [s], the first one before it."""
+        at = int(np.searchsorted(self._times, position, 'right')) - 1
+        return self._poses[max(at, 0)]
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Positions of the first and the last pose [s]."""
+        return float(self._times[0]), float(self._times[-1])
+
+
+def first_time(bag: Bag) -> int:
+    """Log time of the first message [ns since the epoch]."""
+    for message in bag.messages():
+        return message.log_time
+    raise BagError(f'{bag.path} has no message')
+
+
+def duration(bag: Bag) -> float:
+    """From the first message to the last [s]."""
+    last = max(message.log_time for message in bag.messages())
+    return (last - first_time(bag)) * 1e-9

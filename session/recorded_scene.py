@@ -1,0 +1,96 @@
+"""The scene of a bag, made a file again: what was recorded needs nothing but its bag."""
+
+from collections.abc import Mapping
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from bags.errors import BagError
+from bags.frames import first_keyframe
+from bags.reader import Bag
+from session.errors import SessionError
+
+MESH_FILE = 'tissue.vtk'
+
+
+def restore_scene(bag: Bag, folder: Path, changes: Mapping[str, str] | None = None) -> Path:
+    """Writes a bag's scene, and the tissue of its first keyframe as the scene's mesh.
+
+    Args:
+        bag: recorded from the start of its session.
+        folder: where to; exists.
+        changes: by dotted key, in YAML: what is not to be as recorded.
+
+    Returns:
+        The scene file.
+
+    Raises:
+        BagError: the bag has no scene, or does not begin with the tissue.
+        SessionError: a change names no place in the scene.
+    """
+    text = bag.custom_data.get('scene')
+    if text is None:
+        raise BagError(f'{bag.path} has no scene: it was recorded without one')
+    yaml = YAML()
+    scene = yaml.load(text)
+    mesh = first_keyframe(bag)
+    cells = [('tetra', np.asarray(mesh.tetrahedra, np.int64).reshape(-1, 4))]
+    meshio.Mesh(np.asarray(mesh.rest).reshape(-1, 3), cells).write(
+        folder / MESH_FILE, file_format='vtk'
+    )
+    _translate(scene['tissue'])
+    scene['tissue']['mesh'] = MESH_FILE
+    scene['tissue']['unit'] = 'm'
+    for key, value in (changes or {}).items():
+        _change(scene, key, value)
+    path = folder / Path(bag.custom_data.get('scene_file', 'scene.yaml')).name
+    out = StringIO()
+    yaml.dump(scene, out)
+    path.write_text(out.getvalue(), encoding='utf-8')
+    return path
+
+
+def _translate(tissue: dict[str, Any]) -> None:
+    """Says in today's keys what scenes of former versions said in others."""
+    integration = tissue.get('integration') or {}
+    if 'method' in integration:
+        tissue.setdefault('integrator', integration.pop('method'))
+
+
+def parse_changes(arguments: list[str]) -> dict[str, str]:
+    """Dotted keys and values from the form `key=value`.
+
+    Raises:
+        SessionError: one has another form.
+    """
+    changes = {}
+    for argument in arguments:
+        key, equals, value = argument.partition('=')
+        if not equals or not key.strip() or not value.strip():
+            raise SessionError(
+                f'--with {argument}: write key=value, as in tissue.material.toughness=40'
+            )
+        changes[key.strip()] = value.strip()
+    return changes
+
+
+def _change(scene: dict[str, object], key: str, value: str) -> None:
+    *path, last = key.split('.')
+    if not path:
+        raise SessionError(f'--with {key}: give section and key, as in cutting.{key}')
+    try:
+        new = YAML(typ='safe', pure=True).load(value)
+    except YAMLError:
+        raise SessionError(f'--with {key}: {value!r} is no value of a scene file') from None
+    place = scene
+    for part in path:
+        inner = place.setdefault(part, {})
+        if not isinstance(inner, dict):
+            raise SessionError(f'--with {key}: {part} is a value, not a section')
+        place = inner
+    place[last] = new

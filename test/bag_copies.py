@@ -1,0 +1,37 @@
+"""Copies of bags in which something is otherwise."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from bags.metadata import read_metadata
+from bags.reader import Recorded, open_bag
+from bags.topics import POSE
+from bags.writer import BagWriter
+from haptic_bridge.wire import PoseStampedCodec
+
+
+def rewritten(source: Path, target: Path, change: Callable[[Recorded], bytes | None]) -> Path:
+    """A copy of a bag in which messages are changed, or left out where `change` returns None."""
+    bag = open_bag(source)
+    writer = BagWriter(target, custom_data=read_metadata(source)['custom_data'])
+    for topic, kind in bag.topics().items():
+        writer.add_topic(topic, kind, bag.schemas[kind], '', bag.profiles(topic))
+    for m in bag.messages():
+        if (data := change(m)) is not None:
+            writer.write(m.topic, m.log_time, m.publish_time, data, m.sequence)
+    writer.close()
+    return target
+
+
+def moved_by(distance: float, stamp_ns: int) -> Callable[[Recorded], bytes]:
+    """Changes the one device pose of a stamp by a distance along x [m]."""
+    codec = PoseStampedCodec('arm_base')
+
+    def change(m: Recorded) -> bytes:
+        sample = codec.decode(m.data) if m.topic == POSE else None
+        if sample is None or sample.stamp_ns != stamp_ns:
+            return m.data
+        x, *rest = sample.values
+        return codec.encode(sample.stamp_ns, (x + distance, *rest))
+
+    return change

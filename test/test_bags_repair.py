@@ -1,0 +1,148 @@
+"""A bag that was cut off or damaged becomes whole again, with all that can be read in it."""
+
+import itertools
+import multiprocessing
+import os
+import random
+import resource
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_bags import add_topics, read_by_rosbags, some_messages, write_all
+
+from bags.errors import BagError
+from bags.metadata import read_metadata
+from bags.reader import Recorded, open_bag
+from bags.repair import repair_bag
+from bags.writer import BagWriter
+from session.repair import told
+
+MESSAGES = some_messages(500)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    writer = BagWriter(tmp_path / 'session', custom_data={'seed': '7'})
+    add_topics(writer)
+    write_all(writer, MESSAGES)
+    writer.close()
+    return tmp_path / 'session'
+
+
+def cut(folder: Path, size: int) -> Path:
+    path = folder / 'session_0.mcap'
+    os.truncate(path, size)
+    return path
+
+
+def test_a_whole_bag_is_left_alone(folder: Path) -> None:
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert repair_bag(folder).whole
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_bag_cut_off_is_whole_again_with_its_complete_chunks_for_every_reader(
+    folder: Path,
+) -> None:
+    size = (folder / 'session_0.mcap').stat().st_size
+    cut(folder, size * 6 // 10)
+    result = repair_bag(folder)
+    bag = open_bag(folder)
+    kept = list(bag.messages())
+    assert bag.complete and bag.custom_data == {'seed': '7'}
+    assert 200 < len(kept) == result.messages < 500
+    assert kept == MESSAGES[: len(kept)]
+    assert read_by_rosbags(folder) == [(m.topic, m.type, m.log_time, m.data) for m in kept]
+    assert read_metadata(folder)['message_count'] == len(kept)
+    assert result.cut_off > 0 and str(result.cut_off) in told(folder, result)[1]
+    assert sorted(path.name for path in folder.iterdir()) == ['metadata.yaml', 'session_0.mcap']
+    assert repair_bag(folder).whole
+
+
+def test_qos_and_hashes_survive_a_repair(folder: Path) -> None:
+    before = read_metadata(folder)['topics_with_message_count']
+    cut(folder, (folder / 'session_0.mcap').stat().st_size - 10)
+    repair_bag(folder)
+    assert read_metadata(folder)['topics_with_message_count'] == before
+
+
+def test_a_damaged_chunk_in_the_middle_costs_its_own_messages_only(folder: Path) -> None:
+    path = folder / 'session_0.mcap'
+    data = bytearray(path.read_bytes())
+    for i in range(len(data) // 2, len(data) // 2 + 64):
+        data[i] ^= 0xFF
+    path.write_bytes(bytes(data[:-20]))
+    result = repair_bag(folder)
+    assert result.damaged == 1
+    kept = list(open_bag(folder).messages())
+    assert len(kept) == 450
+    assert [m for m in MESSAGES if m in kept] == kept
+
+
+def test_a_bag_without_metadata_gets_it_back(folder: Path) -> None:
+    (folder / 'metadata.yaml').unlink()
+    assert not repair_bag(folder).whole
+    assert read_metadata(folder)['message_count'] == 500
+
+
+def test_where_there_is_no_room_the_bag_stays_as_it_was(folder: Path) -> None:
+    path = cut(folder, (folder / 'session_0.mcap').stat().st_size - 10)
+    before = path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, hard))
+    try:
+        with pytest.raises(BagError, match='is as it was'):
+            repair_bag(folder)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in folder.iterdir()) == ['metadata.yaml', 'session_0.mcap']
+
+
+def endless(count: int) -> Recorded:
+    """A message that anybody can make again who knows its number."""
+    return replace(MESSAGES[count % 500], sequence=count, log_time=MESSAGES[0].log_time + count)
+
+
+def write_for_ever(folder: Path, last: Any) -> None:
+    """Writes as the recorder does: a flush each 0.2 s; says when it wrote last."""
+    writer = BagWriter(folder)
+    add_topics(writer)
+    flushed = time.monotonic()
+    for count in itertools.count():
+        m = endless(count)
+        now = time.time_ns()
+        writer.write(m.topic, m.log_time, now, m.data, m.sequence)
+        last.value = now
+        if time.monotonic() - flushed > 0.2:
+            writer.flush()
+            flushed = time.monotonic()
+        time.sleep(0.0005)
+
+
+def test_a_writer_killed_twenty_times_leaves_all_but_the_last_half_second_bit_for_bit(
+    tmp_path: Path,
+) -> None:
+    source, start = random.Random(4), multiprocessing.get_context('fork')
+    for i in range(20):
+        folder = tmp_path / f'bag{i}'
+        path = folder / f'bag{i}_0.mcap'
+        last = start.Value('q', 0)
+        process = start.Process(target=write_for_ever, args=(folder, last))
+        process.start()
+        while not (path.is_file() and path.stat().st_size > 1000):
+            time.sleep(0.01)
+        time.sleep(source.uniform(0.0, 0.5))
+        process.kill()
+        process.join()
+        repair_bag(folder)
+        bag = open_bag(folder)
+        kept = list(bag.messages())
+        assert bag.complete and kept
+        assert [replace(m, publish_time=0) for m in kept] == [
+            replace(endless(count), publish_time=0) for count in range(len(kept))
+        ]
+        assert last.value - kept[-1].publish_time < 5e8

@@ -1,0 +1,226 @@
+"""What a replay plays and when, what it can reach, and with whom it does not mix."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from cutting_trainer_msgs.msg import ForceSample, Mesh, MeshDelta
+from geometry_msgs.msg import WrenchStamped
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+from bags.player import STEP, Playhead, RecordedHand, RecordedStream, duration
+from bags.player_node import SessionPlayer, publisher_qos
+from bags.reader import open_bag
+from bags.topics import CONTACT, FORCE, MESH, OF_DEVICE, OF_TISSUE, POSE, SERVO_CF, UPDATES
+from session.domain import reserved_domain
+from session.errors import SessionError
+from session.replay import _Over, act_on, replay_nodes
+from tissue_sim import ros
+from tissue_sim.replica import MeshReplica
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / 'bags' / 'samples' / 'format_2' / 'straight_cut'
+SUBSCRIBERS = {
+    MESH: ros.LATCHED,
+    UPDATES: ros.UPDATES,
+    FORCE: ros.STREAM,
+    CONTACT: ros.NEWEST_BEST_EFFORT,
+    POSE: ros.NEWEST_BEST_EFFORT,
+    SERVO_CF: ros.NEWEST_BEST_EFFORT,
+}
+"""What our own nodes ask for."""
+
+
+def test_the_playhead_goes_by_the_clock_times_the_rate_and_stands_while_paused() -> None:
+    head = Playhead(1.0, 9.0, rate=2.0)
+    assert head.move(100.0) == 1.0
+    head.toggle()
+    assert head.move(101.0) == pytest.approx(3.0)
+    head.toggle()
+    assert head.move(105.0) == pytest.approx(3.0)
+    head.step()
+    assert head.move(106.0) == pytest.approx(3.0 + STEP)
+    head.toggle()
+    assert head.move(200.0) == 9.0 and head.over
+
+
+def test_a_loop_begins_again_where_the_replay_began() -> None:
+    head = Playhead(2.0, 4.0, loop=True)
+    head.toggle()
+    head.move(0.0)
+    assert head.move(2.5) == 2.0
+    assert head.rounds == 1 and not head.over
+
+
+def test_keys_pause_step_and_end() -> None:
+    head = Playhead(0.0, 9.0)
+    act_on(' ', head)
+    assert not head.paused
+    act_on('xs', head)
+    assert head.paused and head.position == pytest.approx(STEP)
+    with pytest.raises(_Over):
+        act_on('q', head)
+
+
+def test_a_stream_gives_every_message_once_in_order_and_none_early() -> None:
+    bag = open_bag(SAMPLE)
+    first = next(iter(bag.messages())).log_time
+    middle = (next(iter(bag.messages(OF_TISSUE))).log_time - first) * 1e-9 + 2.0
+    stream = RecordedStream(bag, OF_TISSUE, 0.0)
+    early = list(stream.due(middle))
+    late = list(stream.due(1e9))
+    assert [*early, *late] == list(bag.messages(OF_TISSUE))
+    assert early[-1].log_time <= first + middle * 1e9 < late[0].log_time
+
+
+def test_entering_in_the_middle_works_from_the_next_keyframe() -> None:
+    bag = open_bag(SAMPLE)
+    keyframes = [m.log_time for m in bag.messages([MESH])]
+    start = (keyframes[-1] - next(iter(bag.messages())).log_time) * 1e-9 - 1.0
+    replica, seen = MeshReplica(), []
+    for m in RecordedStream(bag, OF_TISSUE, start).due(1e9):
+        seen.append(m.topic)
+        if m.topic == MESH:
+            replica.load(bag.read(m))
+        elif m.topic == UPDATES:
+            assert replica.apply(bag.read(m))
+    assert seen.count(MESH) == 1 and FORCE in seen[: seen.index(MESH)]
+    whole = MeshReplica()
+    for m in bag.messages([MESH, UPDATES]):
+        (whole.load if m.topic == MESH and whole.revision < 0 else whole.apply)(bag.read(m))  # type: ignore[operator]
+    assert replica.hash() == whole.hash()
+
+
+def test_the_recorded_hand_is_where_it_was() -> None:
+    bag = open_bag(SAMPLE)
+    hand = RecordedHand(bag)
+    first, last = hand.span
+    assert 0.0 <= first < last <= duration(bag)
+    assert hand.pose(-1.0) == hand.pose(first)
+    assert hand.pose(last + 9.0).stamp_ns > hand.pose((first + last) / 2).stamp_ns
+
+
+def test_a_replayed_topic_suits_every_subscriber_of_ours() -> None:
+    bag = open_bag(SAMPLE)
+    for topic, wanted in SUBSCRIBERS.items():
+        offered = publisher_qos(bag.profiles(topic))
+        compatibility, reason = qos_check_compatible(offered, wanted)
+        assert compatibility != QoSCompatibility.ERROR, (topic, reason)
+        assert offered.depth >= 1
+
+
+def test_nodes_of_a_replay_speak_to_no_device_unless_told_to() -> None:
+    def remapped(drive_device: bool) -> list[str]:
+        nodes = replay_nodes(Path('scene.yaml'), None, drive_device=drive_device)
+        bridge = next(node for node in nodes if node.name == 'haptic_bridge')
+        return [word for word in bridge.argv if ':=/replay' in word]
+
+    assert remapped(False) == [
+        'arm/measured_cp:=/replay/arm/measured_cp',
+        'arm/servo_cf:=/replay/arm/servo_cf',
+    ]
+    assert remapped(True) == ['arm/measured_cp:=/replay/arm/measured_cp']
+
+
+@pytest.fixture
+def context() -> Iterator[rclpy.Context]:
+    context = rclpy.Context()
+    with reserved_domain('free') as domain:
+        rclpy.init(context=context, domain_id=domain)
+        yield context
+        rclpy.shutdown(context=context)
+
+
+def test_a_recorded_force_is_played_to_a_device_only_when_told_to(context: rclpy.Context) -> None:
+    for drive in (False, True):
+        player = SessionPlayer(
+            context, Playhead(0.0, 1.0), open_bag(SAMPLE), 0.0, drive_device=drive
+        )
+        assert (SERVO_CF in player.topics) == drive
+        assert all((topic in player.topics) != drive for topic in OF_DEVICE)
+        player.stop()
+
+
+def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
+    context: rclpy.Context,
+) -> None:
+    bag = open_bag(SAMPLE)
+    node = rclpy.create_node('onlooker', context=context)
+    topics = ((Mesh, MESH, ros.LATCHED), (MeshDelta, UPDATES, ros.UPDATES))
+    mesh, deltas = (ros.polled(node, *topic) for topic in topics)
+    forces = ros.polled(node, ForceSample, FORCE, ros.STREAM)
+    wrenches = ros.polled(node, WrenchStamped, SERVO_CF, ros.NEWEST_BEST_EFFORT)
+    playhead = Playhead(0.0, duration(bag), rate=4.0)
+    player = SessionPlayer(context, playhead, bag, 0.0, drive_device=False)
+    replica, heard = MeshReplica(), 0
+    try:
+        player.refuse_live_input(player.topics)
+        assert player.refusal == ''
+        player.advertise()
+        time.sleep(1.0)
+        playhead.toggle()
+        player.start()
+        deadline = time.monotonic() + 20.0
+        while not playhead.over and time.monotonic() < deadline:
+            if (message := ros.take(mesh)) is not None and replica.revision < 0:
+                replica.load(message)
+            while (message := ros.take(deltas)) is not None:
+                replica.apply(message)
+            heard += ros.take_raw(forces) is not None
+            assert ros.take_raw(wrenches) is None
+            time.sleep(0.002)
+        assert playhead.over and heard > 20 and replica.step > 100
+        intruder = node.create_publisher(ForceSample, FORCE, ros.STREAM)
+        deadline = time.monotonic() + 10.0
+        while not player.refusal and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert 'onlooker publishes /tissue/force' in player.refusal
+        node.destroy_publisher(intruder)
+    finally:
+        player.stop()
+        node.destroy_node()
+
+
+def test_a_replay_into_a_live_graph_is_refused_in_one_line(context: rclpy.Context) -> None:
+    node = rclpy.create_node('live_arm', context=context)
+    node.create_publisher(ForceSample, FORCE, ros.STREAM)
+    player = SessionPlayer(context, Playhead(0.0, 1.0), open_bag(SAMPLE), 0.0, drive_device=False)
+    try:
+        player.refuse_live_input(player.topics)
+        assert player.refusal.startswith('live_arm publishes /tissue/force')
+    finally:
+        player.stop()
+        node.destroy_node()
+
+
+@pytest.mark.slow
+def test_the_recorded_hand_cuts_the_tissue_again(tmp_path: Path) -> None:
+    command = [sys.executable, '-m', 'session.cli', 'replay', str(SAMPLE), '--domain', 'free']
+    done = subprocess.run(
+        [*command, '-o', str(tmp_path / 'bag')],
+        cwd=ROOT,
+        env=os.environ,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    bag = open_bag(tmp_path / 'bag')
+    assert SERVO_CF not in bag.topics() and f'/replay{SERVO_CF}' in bag.topics()
+    cut = [m for m in map(bag.read, bag.messages([UPDATES])) if m.cut_step]
+    assert cut
+
+
+def test_a_start_beyond_the_end_is_refused() -> None:
+    from session.replay import ReplayOptions, replay
+
+    options = ReplayOptions(SAMPLE, True, 1.0, 1e4, False, 'free', None, False)
+    with pytest.raises(SessionError, match='the session lasts'):
+        replay(options)
