@@ -12,6 +12,9 @@ NONE, TOUCHING, INSIDE = range(3)
 _VELOCITY_FILTER = 0.005
 """[s] time constant of the velocity that is damped: encoder steps are coarse at 1 kHz."""
 
+_RECOVERY = 0.02
+"""[s] in which the passivity controller takes back what was made; faster is felt as a kick."""
+
 SETUP = np.dtype(
     [
         ('rotation', 'f8', (3, 3)),  # device frame to tissue frame
@@ -20,8 +23,8 @@ SETUP = np.dtype(
         ('force_scale', 'f8'),
         ('blade', 'f8', (2, 3)),  # root and tip [m], tool frame
         ('coupling', 'f8'),  # [N/m]
-        ('period', 'f8'),  # [s] of the loop
         ('law', 'i8'),
+        ('one_force', 'b1'),
         ('max_stiffness', 'f8'),  # [N/m], of the tissue
         ('max_damping', 'f8'),  # [N s/m]
         ('max_force', 'f8'),  # [N]
@@ -37,7 +40,8 @@ STATE = np.dtype(
         ('blade', 'f8', (2, 3)),  # root and tip [m], tissue frame
         ('moved', 'f8', (3,)),  # [m] since the last tick, device frame
         ('velocity', 'f8', (3,)),  # [m/s], device frame
-        ('proxy', 'f8', (3,)),  # [m]
+        ('proxy', 'f8', (3,)),  # [m] on the surface without the dent
+        ('spread', 'f8'),  # sum of the squared shares of the touched nodes
         ('normal', 'f8', (3,)),
         ('external', 'f8', (3,)),  # [N] on the tissue
         ('resistance', 'f8'),  # [N]
@@ -61,8 +65,8 @@ def make_setup(
     setup['force_scale'] = haptics.force_scale
     setup['blade'] = (tool.blade_root, tool.blade_tip)
     setup['coupling'] = tool.coupling_stiffness
-    setup['period'] = 1 / haptics.rate
     setup['law'] = extrapolation.LAWS[haptics.extrapolation]
+    setup['one_force'] = haptics.forces == 'one'
     # The tissue is felt through the coupling spring: no slope steeper than that is real.
     rendered = profile.max_stiffness / (frame.scale * haptics.force_scale)
     setup['max_stiffness'] = min(rendered, tool.coupling_stiffness)
@@ -123,16 +127,14 @@ def _tissue_force(
     out[:] = 0.0
     if contact == NONE:
         return
-    if h.count > 0:
-        extrapolation.estimate(c.law, history, time, s.tip, c.max_stiffness, out)
+    if h.count > 0 and not (c.one_force and contact == TOUCHING):
+        depth = s.proxy - s.tip
+        touching = contact == TOUCHING
+        extrapolation.estimate(
+            c.law, history, time, s.tip, depth, s.spread, touching, c.max_stiffness, out
+        )
     elif contact == TOUCHING:
-        # The tissue has not answered this contact yet: the proxy's spring, no stiffer than it.
-        out[:] = s.proxy - s.tip
-        stiffness = extrapolation.directional_stiffness(h.stiffness, out)
-        if not 0.0 < stiffness < c.coupling:
-            stiffness = c.coupling
-        for k in range(3):
-            out[k] *= stiffness
+        out[:] = -s.external  # as long as the tissue has not answered
     if contact == TOUCHING:
         outward = out[0] * s.normal[0] + out[1] * s.normal[1] + out[2] * s.normal[2]
         if outward < 0.0:
@@ -164,7 +166,8 @@ def command(
     for k in range(3):
         s.velocity[k] += weight * (s.moved[k] / elapsed - s.velocity[k])
         s.moved[k] = 0.0
-        s.external[k] = c.coupling * (s.tip[k] - s.proxy[k])
+        s.external[k] = extrapolation.surface_stiffness(history[0].stiffness, c.coupling)
+        s.external[k] *= s.tip[k] - s.proxy[k]
     felt = np.zeros(3)
     wanted = np.zeros(3)
     _tissue_force(setup, state, history, contact, time, felt)
@@ -174,7 +177,7 @@ def command(
     safety.state_gate(enabled, wanted)
     s.damping = 0.0
     if enabled and contact != NONE:
-        s.damping = safety.control(s.energy, s.velocity, c.period, c.max_damping, wanted)
+        s.damping = safety.control(s.energy, s.velocity, _RECOVERY, c.max_damping, wanted)
     safety.settle(s.force, c.max_slew * elapsed, c.max_force, gain, wanted)
     finite = np.isfinite(safety.norm(wanted))
     for k in range(3):

@@ -20,6 +20,8 @@ FARTHEST = 3.0
 """Intervals between samples that a line is followed: one to compute, one to wait, one lost."""
 SHORTEST = 5e-5
 """[m] Below this distance of two samples their line is encoder noise: the force is held instead."""
+_NEIGHBOUR = 0.2
+"""What a load on a node moves a neighbour by, over what it moves the node: fitted on the liver."""
 
 HISTORY = np.dtype(
     [
@@ -28,6 +30,8 @@ HISTORY = np.dtype(
         ('position', 'f8', (2, 3)),  # [m]
         ('force', 'f8', (2, 3)),  # [N]
         ('stiffness', 'f8', (3, 3)),  # [N/m] of the newest, -d(force)/d(position)
+        ('depth', 'f8', (3,)),  # [m] from tip to proxy in the contact that the newest answers
+        ('spread', 'f8'),  # sum of the squared shares of the nodes in it
         ('topology', 'i8'),
         ('state', 'i8'),
     ]
@@ -126,14 +130,70 @@ def local_stiffness(
 
 
 @njit(cache=True, nogil=True)
-def directional_stiffness(stiffness: np.ndarray, direction: np.ndarray) -> float:
-    """d.K.d / d.d [N/m]: what a spring K [N/m], shape (3, 3), resists along d, shape (3,)."""
-    squared = resisted = 0.0
+def surface_stiffness(stiffness: np.ndarray, largest: float) -> float:
+    """Gives k of a frictionless contact K = k n n^T [N/m], shape (3, 3); `largest` if unknown.
+
+    The normal may turn on the way, k is taken along.
+    """
+    k = np.sqrt(np.sum(stiffness * stiffness))
+    return k if 0.0 < k < largest else largest
+
+
+@njit(cache=True, nogil=True)
+def local_surface(
+    depth: np.ndarray,
+    at: np.ndarray,
+    force: np.ndarray,
+    stiffness: float,
+    here: float,
+    out: np.ndarray,
+) -> None:
+    """F = n (F_i . n_i + k |d| - k_i |d_i|): the local stiffness on a surface with edges.
+
+    d = |d| n leads from the tip to the proxy on the surface without the tool's dent. On a plane of
+    even stiffness this is F_i - k n n^T (P - P_i).
+
+    Args:
+        depth: d [m], shape (3,).
+        at: d_i [m], shape (3,).
+        force: F_i [N], shape (3,).
+        stiffness: k_i [N/m].
+        here: k [N/m].
+        out: F [N], shape (3,).
+    """
+    deep = before = along = 0.0
     for k in range(3):
-        squared += direction[k] * direction[k]
-        for j in range(3):
-            resisted += direction[k] * stiffness[k, j] * direction[j]
-    return resisted / squared if squared > 0.0 else 0.0
+        deep += depth[k] * depth[k]
+        before += at[k] * at[k]
+        along += force[k] * at[k]
+    deep, before = np.sqrt(deep), np.sqrt(before)
+    out[:] = 0.0
+    if deep == 0.0:
+        return
+    pressed = along / before if before > 0.0 else 0.0
+    pressed += here * deep - stiffness * before
+    for k in range(3):
+        out[k] = max(pressed, 0.0) / deep * depth[k]
+
+
+@njit(cache=True, nogil=True)
+def elsewhere(stiffness: float, coupling: float, before: float, here: float) -> float:
+    """Stiffness of spring and tissue in series where the load is spread otherwise [N/m].
+
+    A point load sinks deeper at a node than between nodes, by up to half on a coarse mesh. With
+    equal nodes and the part `_NEIGHBOUR` of the sinking at their neighbours, shares w give the
+    tissue a compliance in proportion to `_NEIGHBOUR` + (1 - `_NEIGHBOUR`) sum w^2.
+
+    Args:
+        stiffness: where it is known, in series with the coupling [N/m].
+        coupling: [N/m].
+        before, here: sum of the squared shares of the nodes there and here, 0 where unknown.
+    """
+    if before <= 0.0 or here <= 0.0 or stiffness >= coupling:
+        return stiffness
+    soft = 1.0 / stiffness - 1.0 / coupling
+    soft *= (_NEIGHBOUR + (1.0 - _NEIGHBOUR) * here) / (_NEIGHBOUR + (1.0 - _NEIGHBOUR) * before)
+    return 1.0 / (1.0 / coupling + soft)
 
 
 @njit(cache=True, nogil=True)
@@ -142,25 +202,38 @@ def estimate(
     history: np.ndarray,
     time: int,
     position: np.ndarray,
+    depth: np.ndarray,
+    spread: float,
+    touching: bool,
     max_stiffness: float,
     out: np.ndarray,
 ) -> None:
-    """The force at (time, position) by one of `LAWS`; held where the history has a single sample.
+    """The force at (time, position) by one of `LAWS`.
+
+    A single sample has no line: TIME holds it, POSITION follows the stiffness there.
 
     Args:
         law: CONSTANT, TIME, POSITION or LOCAL_STIFFNESS.
         history: of at least one sample, dtype HISTORY, shape (1,).
         time: [ns] of the device pose.
         position: of the tool tip [m], shape (3,).
+        depth: from there to the proxy [m], shape (3,).
+        spread: sum of the squared shares of the touched nodes.
+        touching: the tool is on the surface, not in the tissue.
         max_stiffness: [N/m].
         out: [N], shape (3,).
     """
     h = history[0]
-    if law == LOCAL_STIFFNESS:
+    local = law == LOCAL_STIFFNESS or (law == POSITION and h.count < 2)
+    if local and touching:
+        k = surface_stiffness(h.stiffness, max_stiffness)
+        here = elsewhere(k, max_stiffness, h.spread, spread)
+        local_surface(depth, h.depth, h.force[1], k, here, out)
+    elif local:
         local_stiffness(position, h.position[1], h.force[1], h.stiffness, max_stiffness, out)
     elif law == TIME and h.count == 2:
         time_linear(time, h.time, h.force, out)
-    elif law == POSITION and h.count == 2:
+    elif law == POSITION:
         position_linear(position, h.position, h.force, max_stiffness, out)
     else:
         constant(h.force[1], out)
@@ -177,6 +250,8 @@ def push(
     position: np.ndarray,
     force: np.ndarray,
     stiffness: np.ndarray,
+    depth: np.ndarray,
+    spread: float,
     *,
     topology: int,
     state: int,
@@ -190,6 +265,8 @@ def push(
         force: [N], shape (3,).
         stiffness: [N/m], shape (3, 3); all zero where the simulation has none: the last known one
             is kept.
+        depth: from tip to proxy in the contact that the sample answers [m], shape (3,).
+        spread: sum of the squared shares of the nodes in it.
         topology: connectivity count of the mesh that the sample stems from.
         state: contact state that it stems from.
     """
@@ -201,5 +278,7 @@ def push(
         h[name][1] = value
     if np.any(stiffness):
         h['stiffness'] = stiffness
+    h['depth'] = depth
+    h['spread'] = spread
     h['topology'] = topology
     h['state'] = state

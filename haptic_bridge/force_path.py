@@ -12,8 +12,9 @@ import numpy as np
 
 from haptic_bridge import chain, extrapolation, safety
 from haptic_bridge.chain import INSIDE, NONE, TOUCHING
+from haptic_bridge.comparators import CONTACTS
+from haptic_bridge.ground import Ground
 from haptic_bridge.operating_state import State
-from haptic_bridge.proxy import Proxy
 from haptic_bridge.settings import (
     DeviceProfile,
     DeviceSettings,
@@ -27,10 +28,13 @@ from haptic_bridge.wire import ForceSampleCodec, Sample
 _SECOND = 1e-9
 _LONGEST_STEP = 0.005
 """[s] of slew that a late tick may catch up on."""
-_FRAME_RANGE = (0.01, 0.05)
-"""[s] between the surfaces that a blend is spread over; frames outside are late, not slow."""
 _UNNOTICED_NS = 3_000_000
 """[ns] that a sample may lie unread: its age counts from before that, so that deadlines hold."""
+_REMEMBERED = 4096
+"""Contacts of which the answer may still come."""
+ENERGY_CREDIT = 2e-4
+"""[J] that the force loop may have made in all before the passivity controller acts, a fifth of
+what a press of 5 mm on liver stores: below it are encoder steps and errors of extrapolation."""
 _NOWHERE = ((0,) * 9, (0.0,) * 9, (0.0,) * 3, (0.0,) * 3)
 
 
@@ -88,17 +92,16 @@ class ForcePath:
         self._state = np.zeros(1, chain.STATE)
         self._s: Any = self._state[0]
         self._history = np.zeros(1, extrapolation.HISTORY)
-        self._proxy = Proxy(tool.radius)
+        self._proxy = CONTACTS[haptics.contact](tool.radius)
         self._tail = (tool.coupling_stiffness, tool.radius)
         self._pose = np.zeros(7)
         self._pose_stamp = self._pose_ns = 0
         self._sample_ns = self._current_ns = self._start_ns = self._last_ns = 0
         self._step = self._sample_revision = -1
         self._sample_state = NONE
-        self._surface: Surface | None = None
-        self._surface_ns = 0
-        self._frame = _FRAME_RANGE[1]
-        self._sequence = self._began = 0
+        self._ground = Ground()
+        self._sequence = self._began = self._left = 0
+        self._depths = np.zeros((_REMEMBERED, 4))
         self._contact = NONE
         self._was_enabled = self._stale = False
 
@@ -120,7 +123,7 @@ class ForcePath:
     @property
     def energy(self) -> float:
         """What the hand has put in, net [J]; negative: the force loop has made energy."""
-        return float(self._s['energy'])
+        return float(self._s['energy']) - ENERGY_CREDIT
 
     @property
     def damping(self) -> float:
@@ -247,21 +250,30 @@ class ForcePath:
                 position,
                 force,
                 stiffness,
+                self._depths[int(values[3]) % _REMEMBERED, :3],
+                self._depths[int(values[3]) % _REMEMBERED, 3],
                 topology=int(values[2]),
                 state=self._sample_state,
             )
+        elif self._contact == NONE and int(values[3]) > self._left:
+            # What the tissue says of a place that the tool comes near to.
+            if stiffness.any():
+                self._history['stiffness'] = stiffness
+            if self._sample_state == NONE:
+                self._ground.answered_free(now_ns, self._sample_revision)
         return ''
 
     def _begin(self, now_ns: int) -> None:
         self._start_ns = now_ns
         self._stale = False
-        self._s['energy'] = 0.0
+        self._s['energy'] = ENERGY_CREDIT
         self._s['velocity'] = 0.0
         self._leave_contact()
 
     def _leave_contact(self) -> None:
         self._proxy.reset()
         self._contact = NONE
+        self._left = self._sequence
         extrapolation.clear(self._history)
 
     def _gain(self, now_ns: int, enabled: bool) -> float:
@@ -278,7 +290,7 @@ class ForcePath:
         )
 
     def _touch(self, now_ns: int, surface: Surface | None, enabled: bool) -> Any:
-        """Moves the proxy; returns its contact where it touches, else None."""
+        """Moves the proxy; returns what it touches or comes near to, None where it has no say."""
         self._sequence += 1
         self._follow(now_ns, surface)
         before = self._contact
@@ -287,6 +299,7 @@ class ForcePath:
             # The samples of the cut stay: the change of state has already voided the older ones.
             if before != INSIDE:
                 self._proxy.reset()
+                self._ground.release()
             self._contact = INSIDE
             self._s['proxy'] = self._s['tip']
             return None
@@ -296,40 +309,45 @@ class ForcePath:
         if not enabled or surface is None:
             self._s['proxy'] = self._s['tip']
             return None
-        touched = self._proxy.step(surface, self._blend(now_ns), self._s['tip'])
+        ground = self._ground.surface
+        assert ground is not None
+        touched = self._proxy.step(ground, self._ground.blend(now_ns), self._s['tip'])
         self._s['proxy'] = touched.position
+        self._s['spread'] = touched.spread
+        slot = self._sequence % _REMEMBERED
+        self._depths[slot, :3] = touched.position - self._s['tip']
+        self._depths[slot, 3] = touched.spread
         self._contact = TOUCHING if touched.touching else NONE
         if self._contact != before:
             extrapolation.clear(self._history)
+            self._left = self._sequence
         if not touched.touching:
-            return None
+            return touched
+        self._ground.press()
         if before != TOUCHING:
             self._began = self._sequence
-            # What the last contact dissipated is no credit for this one.
-            self._s['energy'] = min(self._s['energy'], 0.0)
+            # What the last contact dissipated is no credit for this one, what it made is a debt.
+            self._s['energy'] = min(self._s['energy'], ENERGY_CREDIT)
         self._s['normal'] = touched.normal
         return touched
 
     def _follow(self, now_ns: int, surface: Surface | None) -> None:
         if surface is None:
             return
-        if surface is not self._surface:
-            shortest, longest = _FRAME_RANGE
-            self._frame = min(max((now_ns - self._surface_ns) * _SECOND, shortest), longest)
-            self._surface, self._surface_ns = surface, now_ns
+        self._ground.follow(now_ns, surface)
         if surface.revision >= self._sample_revision:
             self._current_ns = now_ns
-
-    def _blend(self, now_ns: int) -> float:
-        return min((now_ns - self._surface_ns) * _SECOND / self._frame, 1.0)
 
     def _contact_values(self, surface: Surface | None, touched: Any) -> tuple[float, ...]:
         s = self._s
         revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
         nodes, weights, point, normal = _NOWHERE
+        proxy = s['tip'] - s['external'] / self._tail[0]
         if touched is not None:
-            nodes, weights = touched.nodes.tolist(), touched.weights.tolist()
-            point, normal = touched.contact.tolist(), s['normal'].tolist()
+            nodes = np.maximum(touched.nodes, 0).tolist()
+            weights = touched.weights.tolist()
+            point = (proxy + (touched.contact - touched.position)).tolist()
+            normal = touched.normal.tolist()
         return (
             self._sequence,
             self._contact,
@@ -338,7 +356,7 @@ class ForcePath:
             *nodes,
             *weights,
             *s['tip'].tolist(),
-            *s['proxy'].tolist(),
+            *proxy.tolist(),
             *point,
             *normal,
             *s['external'].tolist(),

@@ -22,9 +22,13 @@ class Touch:
         position: centre of the sphere [m], shape (3,).
         contact: mean of the touched points, by load [m], shape (3,).
         normal: unit vector from the device to the centre: where the surface pushes, shape (3,).
-        nodes: of up to three touched triangles, most loaded first, shape (9,).
+        nodes: of up to three touched triangles, most loaded first, shape (9,); any
+            number where the weight is 0.
         weights: share of each in the load: barycentric in a triangle, times the share of the
             triangle; not negative, sum 1 in all; 0 where unused, shape (9,).
+
+    Where nothing is touched, contact to weights are those of the nearest point within five radii;
+    all weights are 0 if there is none.
         valid: False where the last input was not finite; nothing has changed then.
     """
 
@@ -44,8 +48,13 @@ class Touch:
 
     @property
     def touching(self) -> bool:
-        """Whether the surface holds the proxy back; contact to weights mean something only then."""
+        """Whether the surface holds the proxy back."""
         return bool(self._state['touching'][0])
+
+    @property
+    def spread(self) -> float:
+        """Sum of the squared shares of the touched nodes: 1 on a node, a third between three."""
+        return float(self._state['spread'][0])
 
     @property
     def depth(self) -> float:

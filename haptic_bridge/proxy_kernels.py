@@ -23,6 +23,7 @@ STATE = np.dtype(
         ('normal', 'f8', (3,)),
         ('nodes', 'i8', (3 * PATCHES,)),
         ('weights', 'f8', (3 * PATCHES,)),
+        ('spread', 'f8'),
         ('push', 'f8', (MOST_PUSHES,)),  # [m] part of the depth that a triangle holds
         ('push_normal', 'f8', (MOST_PUSHES, 3)),
         ('push_slot', 'i8', (MOST_PUSHES,)),
@@ -50,6 +51,8 @@ _ENTRY = 0.01
 """Height in radii over the surface from which a proxy that was inside is pushed out."""
 _TOUCH = 0.01
 """Gap under the sphere, in radii, that still is contact: on an edge the search ends just above."""
+_FORESIGHT = 5.0
+"""Distance in radii from which a free sphere names the triangle that it comes to."""
 _SHARING = 0.02
 """How much farther than the nearest, in parts, a triangle may be to take its share."""
 _SAME = 0.9999
@@ -82,7 +85,7 @@ def follow_device(
     s.goal[:] = device
     _seek(surface, blend, min(stride, 2.0 * radius), _MARGIN * radius, radius, state)
     s.depth = _distance(device, s.position)
-    _report(surface, radius, state)
+    _report(surface, blend, radius, state)
 
 
 @njit(cache=True, nogil=True)
@@ -284,7 +287,7 @@ def _leave_tissue(surface: Geometry, blend: float, radius: float, state: np.ndar
 
 
 @njit(cache=True, nogil=True)
-def _report(surface: Geometry, radius: float, state: np.ndarray) -> None:
+def _report(surface: Geometry, blend: float, radius: float, state: np.ndarray) -> None:
     """Shares the force among the triangles under the sphere, as a frictionless contact does.
 
     In a dent or a crease the sphere rests on several triangles: their pushes, none of which pulls,
@@ -293,10 +296,9 @@ def _report(surface: Geometry, radius: float, state: np.ndarray) -> None:
     s = state[0]
     near = s.near[0]
     s.touching = False
-    if near.count == 0 or s.depth <= 1e-9:
-        return
-    nearest = near.distance[near.order[0]]
-    if nearest > (1.0 + _TOUCH) * radius:
+    nearest = near.distance[near.order[0]] if near.count > 0 else np.inf
+    if s.depth <= 1e-9 or nearest > (1.0 + _TOUCH) * radius:
+        _foresee(surface, blend, radius, state)
         return
     found = _touched(surface, max(nearest * (1.0 + _SHARING), nearest + TIED), state)
     residual = s.step
@@ -313,6 +315,24 @@ def _report(surface: Geometry, radius: float, state: np.ndarray) -> None:
                 residual[axis] -= change * n[axis]
     s.touching = True
     _write_patches(surface, state)
+
+
+@njit(cache=True, nogil=True)
+def _foresee(surface: Geometry, blend: float, radius: float, state: np.ndarray) -> None:
+    """Names the triangle that a free sphere is nearest to, where one is near."""
+    s = state[0]
+    near = s.near[0]
+    s.nodes[:] = -1
+    s.weights[:] = 0.0
+    gather(surface, blend, s.position, _FORESIGHT * radius, 1, s.near)
+    if near.count == 0 or near.distance[near.order[0]] <= 1e-12:
+        return
+    slot = near.order[0]
+    for axis in range(3):
+        s.nodes[axis] = surface.triangles[near.triangle[slot], axis]
+        s.weights[axis] = near.weights[slot, axis]
+        s.contact[axis] = near.closest[slot, axis]
+        s.normal[axis] = (s.position[axis] - s.contact[axis]) / near.distance[slot]
 
 
 @njit(cache=True, nogil=True)
@@ -385,6 +405,11 @@ def _write_patches(surface: Geometry, state: np.ndarray) -> None:
             s.contact[axis] += push * near.closest[slot, axis]
     for i in range(3 * PATCHES):
         s.weights[i] /= total
+    s.spread = 0.0
+    for i in range(3 * PATCHES):
+        for j in range(3 * PATCHES):
+            if s.nodes[i] == s.nodes[j]:
+                s.spread += s.weights[i] * s.weights[j]
     for axis in range(3):
         s.contact[axis] /= total
         s.normal[axis] = (s.position[axis] - s.device[axis]) / s.depth

@@ -157,7 +157,14 @@ class HapticsSettings(SceneModel):
     """Scene section `haptics`."""
 
     extrapolation: Literal['constant', 'time', 'position', 'local_stiffness'] = Field(
-        'position', description='what becomes of the 30 Hz force between two frames'
+        'local_stiffness', description='what becomes of the 30 Hz force between two frames'
+    )
+    contact: Literal['proxy', 'penalty', 'god_object'] = Field(
+        'proxy', description='how the tool is held out; the others are there to compare'
+    )
+    forces: Literal['two', 'one'] = Field(
+        'two',
+        description="two: the hand feels the tissue's reaction; one: what the proxy does to it",
     )
     rate: float = Field(1000.0, ge=100, le=5000, description='[Hz] of the force loop')
     stale_after: float = Field(

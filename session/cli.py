@@ -214,6 +214,31 @@ def compare_cuts(
     write_cases(output)
 
 
+@app.command('haptics-accuracy', epilog=EXIT_STATUSES)
+def haptics_accuracy(
+    output: Annotated[
+        Path,
+        typer.Option('--output', '-o', help='Folder with haptics.md, for tables and picture.'),
+    ] = Path('docs'),
+) -> None:
+    """Measure the force between frames against a tissue that runs at 1 kHz."""
+    from session.haptics_accuracy import run_accuracy
+
+    _leave_with(run_accuracy(output))
+
+
+@app.command('haptics-stability', epilog=EXIT_STATUSES)
+def haptics_stability(
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='Folder for the table and the picture.')
+    ] = Path('docs'),
+) -> None:
+    """Map where the tool can be held still, by hand, tissue, delay and loss."""
+    from session.haptics_stability import run_stability
+
+    _leave_with(run_stability(output))
+
+
 @app.command('fuzz-cuts', epilog=EXIT_STATUSES)
 def fuzz_cuts(
     strokes: Annotated[int, typer.Option(min=1, help='How many random strokes.')] = 10000,
@@ -328,6 +353,14 @@ def test(context: typer.Context) -> None:
     status, sentence = verdict(results)
     console.print(sentence, style='bold red' if status else 'bold green', highlight=False)
     raise typer.Exit(status)
+
+
+def _leave_with(failures: list[str]) -> None:
+    """Prints what has failed and leaves with the status for it."""
+    console = Console(stderr=True, soft_wrap=True)
+    for failure in failures:
+        console.print(f'[bold red]no:[/] {escape(failure)}', highlight=False)
+    raise typer.Exit(int(Status.FAILED if failures else Status.OK))
 
 
 def main(arguments: list[str] | None = None) -> None:

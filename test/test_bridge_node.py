@@ -166,7 +166,7 @@ def test_contacts_count_on_and_name_the_pose_that_they_stem_from(record):
     weights = pressed.values[ContactCodec.fields['weights']]
     assert sum(weights) == pytest.approx(1)
     external = pressed.values[ContactCodec.fields['external_force']]
-    np.testing.assert_allclose(external, [0, 0, -200.0 * DEPTH], atol=1e-6)
+    np.testing.assert_allclose(external, [0, 0, -K * DEPTH], atol=1e-6)
 
 
 def test_diagnostics_tell_rate_ages_and_faults(record):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from haptic_bridge import extrapolation as ex
@@ -35,8 +35,19 @@ def position_law(p, samples, max_stiffness=STIFF):
 def history(*samples, topology=1, state=1):
     h = np.zeros(1, ex.HISTORY)
     for time, position, force in samples:
-        ex.push(h, ns(time), position, force, np.zeros((3, 3)), topology=topology, state=state)
+        push(h, ns(time), position, force, topology=topology, state=state)
     return h
+
+
+def push(h, time, position, force, k=0.0, depth=(0, 0, 0), spread=0.0, **where):
+    ex.push(h, time, position, force, k * np.eye(3), np.array(depth, float), spread, **where)
+
+
+def estimate(law, h, time, position, depth=(0, 0, 0), spread=0.0, touching=True, limit=STIFF):
+    out = np.zeros(3)
+    at, d = np.array(position, float), np.array(depth, float)
+    ex.estimate(law, h, time, at, d, spread, touching, limit, out)
+    return out
 
 
 def test_constant_law_is_the_last_force():
@@ -122,19 +133,73 @@ def test_local_stiffness_is_no_stiffer_than_the_device_renders():
     assert np.linalg.norm(out) <= 400.0 * 1e-3
 
 
-def test_directional_stiffness_is_the_resistance_along_a_direction():
-    k = np.diag([10.0, 20.0, 30.0])
-    assert ex.directional_stiffness(k, np.array([0, 0, -2e-3])) == pytest.approx(30)
-    assert ex.directional_stiffness(k, np.array([1e-3, 1e-3, 0])) == pytest.approx(15)
-    assert ex.directional_stiffness(k, np.zeros(3)) == 0
+def surface_law(depth, at, force, k, here):
+    out = np.zeros(3)
+    ex.local_surface(np.array(depth, float), np.array(at, float), np.array(force), k, here, out)
+    return out
 
 
-@pytest.mark.parametrize('law', [ex.CONSTANT, ex.TIME, ex.POSITION])
+@settings(deadline=None)
+@given(st.floats(0, 6.28), st.floats(1e-4, 0.01), st.floats(1e-4, 0.01), st.floats(10, 500))
+def test_surface_law_is_exact_on_an_even_plane_however_it_is_tilted(angle, before, now, k):
+    n = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    force = surface_law(now * n, before * n, k * before * n, k, k)
+    np.testing.assert_allclose(force, k * now * n, rtol=1e-9, atol=1e-12)
+
+
+def test_surface_law_turns_the_force_with_the_surface_over_an_edge():
+    half = np.sqrt(0.5)
+    force = surface_law([half * 2e-3, 0, half * 2e-3], [0, 0, 2e-3], [0, 0, 0.2], 100.0, 100.0)
+    np.testing.assert_allclose(force, [half * 0.2, 0, half * 0.2])
+
+
+def test_surface_law_never_pulls_and_ends_where_the_surface_is_left():
+    assert not surface_law([0, 0, 0], [0, 0, 2e-3], [0, 0, 0.2], 100.0, 100.0).any()
+    assert not surface_law([0, 0, 1e-3], [0, 0, 5e-3], [0, 0, 0.1], 100.0, 100.0).any()
+
+
+def test_stiffness_of_a_surface_is_that_along_its_normal_and_the_largest_where_unknown():
+    n = np.array([0.6, 0.0, 0.8])
+    assert ex.surface_stiffness(80.0 * np.outer(n, n), 200.0) == pytest.approx(80.0)
+    assert ex.surface_stiffness(np.zeros((3, 3)), 200.0) == 200.0
+    assert ex.surface_stiffness(900.0 * np.outer(n, n), 200.0) == 200.0
+
+
+@settings(deadline=None)
+@given(st.floats(1 / 3, 1), st.floats(1 / 3, 1), st.floats(1, 199))
+def test_a_load_on_a_node_is_softer_than_one_between_and_the_way_back_undoes_the_way(a, b, k):
+    there = ex.elsewhere(k, 200.0, a, b)
+    assert (there - k) * (a - b) >= 0
+    assert ex.elsewhere(there, 200.0, b, a) == pytest.approx(k, rel=1e-6)
+
+
+@pytest.mark.parametrize('law', [ex.CONSTANT, ex.TIME])
 def test_one_sample_is_held(law):
     h = history((0.0, [0, 0, 0], [0, 0, 0.4]))
-    out = np.zeros(3)
-    ex.estimate(law, h, ns(1.0), np.array([0, 0, 0.01]), STIFF, out)
-    np.testing.assert_array_equal(out, [0, 0, 0.4])
+    np.testing.assert_array_equal(estimate(law, h, ns(1.0), [0, 0, 0.01]), [0, 0, 0.4])
+
+
+def test_first_sample_of_a_contact_is_followed_by_the_stiffness_until_there_is_a_line():
+    h = np.zeros(1, ex.HISTORY)
+    k = 60.0 / np.sqrt(3)  # of which k I has the norm 60
+    push(h, 0, [0, 0, -1e-3], [0, 0, 0.06], k, depth=(0, 0, 1e-3), topology=1, state=1)
+    deeper = estimate(ex.POSITION, h, ns(0.02), [0, 0, -3e-3], depth=(0, 0, 3e-3))
+    np.testing.assert_allclose(deeper, [0, 0, 0.18])
+
+
+@pytest.mark.parametrize('law', ex.LAWS.values())
+def test_a_resting_tool_does_not_blow_up(law):
+    """A trembling encoder under samples that differ: the force stays with the last of them."""
+    h = np.zeros(1, ex.HISTORY)
+    noise = np.random.default_rng(0)
+    for i in range(60):
+        tip = [0, 0, -2e-3 + 2e-5 * noise.integers(-1, 2)]
+        push(h, ns(i * FRAME), tip, [0, 0, 0.2 + 0.02 * noise.uniform(-1, 1)], 50.0, (0, 0, 2e-3),
+             topology=1, state=1)  # fmt: skip
+        for _ in range(5):
+            at = [0, 0, -2e-3 + 2e-5 * noise.integers(-1, 2)]
+            out = estimate(law, h, ns((i + 0.9) * FRAME), at, depth=(0, 0, -at[2]))
+            assert abs(out[2] - h[0]['force'][1, 2]) < 0.05
 
 
 @pytest.mark.parametrize('change', [{'topology': 2}, {'state': 2}])
@@ -142,16 +207,14 @@ def test_a_cut_or_another_contact_state_makes_older_samples_void(change):
     h = history((0.0, [0, 0, 0], [0, 0, 0.1]), (FRAME, [0, 0, -1e-3], [0, 0, 0.2]))
     assert h[0]['count'] == 2
     kept = {'topology': 1, 'state': 1} | change
-    ex.push(h, ns(2 * FRAME), [0, 0, -2e-3], [0, 0, 0.9], np.zeros((3, 3)), **kept)
+    push(h, ns(2 * FRAME), [0, 0, -2e-3], [0, 0, 0.9], **kept)
     assert h[0]['count'] == 1
-    out = np.zeros(3)
-    ex.estimate(ex.POSITION, h, 0, np.array([0, 0, -5e-3]), STIFF, out)
-    np.testing.assert_array_equal(out, [0, 0, 0.9])
+    np.testing.assert_array_equal(estimate(ex.TIME, h, ns(3 * FRAME), [0, 0, 0]), [0, 0, 0.9])
 
 
 def test_stiffness_outlives_a_sample_without_one():
     h = np.zeros(1, ex.HISTORY)
-    ex.push(h, 0, [0, 0, 0], [0, 0, 0], 30 * np.eye(3), topology=1, state=1)
+    push(h, 0, [0, 0, 0], [0, 0, 0], 30.0, topology=1, state=1)
     ex.clear(h)
-    ex.push(h, 1, [0, 0, 0], [0, 0, 0], np.zeros((3, 3)), topology=1, state=0)
+    push(h, 1, [0, 0, 0], [0, 0, 0], topology=1, state=0)
     np.testing.assert_array_equal(h[0]['stiffness'], 30 * np.eye(3))

@@ -36,7 +36,7 @@ class Rig:
         self.state = State.ENABLED
         self.surface = flat_surface(revision=0)
         self.sim = self.mesh = self.poses = True
-        self.topology, self.inside = 1, False
+        self.topology, self.inside, self.near = 1, False, False
         self.forces, self.ticks = [], []
         self.last_contact = None
         self.spoil = lambda sample: sample
@@ -79,7 +79,7 @@ class Rig:
         stamp = divmod(self.last_contact.contact_stamp_ns, 10**9)
         state = INSIDE if self.inside else state
         head = (self.step, self.step, self.topology, values[0], *stamp, state)
-        stiffness = (*(0.0,) * 8, K if state != NONE else 0.0)
+        stiffness = (*(0.0,) * 8, K if state != NONE or self.near else 0.0)
         sample = Sample(
             self.now,
             'tissue',
@@ -148,6 +148,34 @@ def test_contact_made_between_frames_is_felt_at_once_no_stiffer_than_the_tissue_
     assert force == pytest.approx(K * 2e-3)
 
 
+def test_onset_of_contact_does_not_drop_when_the_tissue_answers():
+    """The tool comes near, so the tissue has told its stiffness before the touch."""
+    rig = Rig()
+    rig.near = True
+    force = rig.run(lowered(5e-3, 400))[:, 2]
+    depth = np.maximum(RADIUS - lowered(5e-3, 400), 0.0)
+    np.testing.assert_allclose(force, K * depth, atol=0.02 * K * 5e-3)
+
+
+def test_a_tool_that_is_near_names_the_triangle_that_it_would_touch():
+    rig = Rig()
+    rig.run([RADIUS + 5e-3])
+    assert rig.contact('state') == (NONE,)
+    assert sum(rig.contact('weights')) == pytest.approx(1)
+    np.testing.assert_allclose(rig.contact('normal'), [0, 0, 1])
+    rig.run([RADIUS + 0.02])
+    assert not any(rig.contact('weights'))
+
+
+@pytest.mark.parametrize('forces', ['one', 'two'])
+def test_one_force_is_the_proxys_and_two_are_the_tissues(forces):
+    """A tissue that says it is softer than it answers: the two differ."""
+    rig = Rig(haptics=QUIET.model_copy(update={'forces': forces}))
+    rig.spoil = lambda sample: spoiled(sample, stiffness=(*(0.0,) * 8, K / 2))
+    force = rig.run(np.concatenate([lowered(5e-3, 300), np.full(100, RADIUS - 5e-3)]))[-1, 2]
+    assert force == pytest.approx((K / 2 if forces == 'one' else K) * 5e-3, rel=1e-6)
+
+
 def test_the_very_first_contact_is_felt_through_the_coupling():
     rig = Rig()
     rig.run(np.full(40, RADIUS + 1e-3))
@@ -155,11 +183,13 @@ def test_the_very_first_contact_is_felt_through_the_coupling():
     assert rig.run(np.full(5, RADIUS - 2e-3))[-1, 2] == pytest.approx(200.0 * 2e-3)
 
 
-def test_the_tissue_gets_the_force_of_the_proxy_spring():
+def test_proxy_spring_and_tissue_share_the_depth_by_their_stiffness():
     rig = pressed(depth=5e-3)
-    np.testing.assert_allclose(rig.contact('external_force'), [0, 0, -200.0 * 5e-3], atol=1e-9)
+    np.testing.assert_allclose(rig.contact('external_force'), [0, 0, -K * 5e-3], atol=1e-9)
     assert sum(rig.contact('weights')) == pytest.approx(1)
     np.testing.assert_allclose(rig.contact('normal'), [0, 0, 1], atol=1e-9)
+    stretch = np.subtract(rig.contact('device'), rig.contact('proxy'))
+    np.testing.assert_allclose(200.0 * stretch, rig.contact('external_force'), atol=1e-9)
 
 
 def test_a_touched_surface_never_pulls():
@@ -347,7 +377,7 @@ def test_sliding_into_a_cut_does_not_interrupt_the_force():
 
 
 def test_a_change_of_connectivity_voids_the_line_of_the_older_sample():
-    rig = pressed()
+    rig = pressed(haptics=QUIET.model_copy(update={'extrapolation': 'time'}))
     rig.run(np.linspace(RADIUS - 5e-3, RADIUS - 6e-3, FRAME))
     rig.topology = 2
     rig.run(np.full(FRAME - rig.ms % FRAME, RADIUS - 6e-3))

@@ -8,7 +8,7 @@ from tissue_sim.elasticity import ElasticModel, stiffness_product
 
 @njit(cache=True, fastmath=True, error_model='numpy')
 def _conjugate_gradients(operands, preconditioner, b, x, work, steps):
-    """Preconditioned conjugate gradients on K x = b from x; returns 2 b.x - x.K x <= b.K^-1 b."""
+    """Preconditioned conjugate gradients on K x = b from x; the residual is left in work[0]."""
     r, p, q = work[0], work[1], work[2]
     stiffness_product(operands, x, q)
     rho = 0.0
@@ -36,10 +36,6 @@ def _conjugate_gradients(operands, preconditioner, b, x, work, steps):
         for i in range(x.shape[0]):
             p[i] = preconditioner[i] * r[i] + after / rho * p[i]
         rho = after
-    total = 0.0
-    for i in range(x.shape[0]):
-        total += x[i] * (b[i] + r[i])
-    return total
 
 
 def solve_static(
@@ -73,44 +69,53 @@ def _diagonal_preconditioner(model: ElasticModel, free: np.ndarray) -> np.ndarra
 
 
 class PointCompliance:
-    """How far a point of the tissue yields to a unit force: a value that sharpens by the frame.
+    """How far a point of the tissue yields to unit forces: a value that sharpens by the frame.
 
-    The estimate is 2 b.x - x.K x for the present x: never above the true compliance, equal to it in
-    the end. The solution is kept while the contact stays near, so a few steps a frame suffice.
+    The estimate is B.X + X.B - X.K X for the present X: never above the true compliance B.K^-1 B,
+    equal to it in the end. The solution is kept while the contact stays near, so a few steps a
+    frame suffice.
 
     Args:
-        steps: conjugate-gradient steps a call.
+        steps: conjugate-gradient steps a call and direction.
     """
 
     def __init__(self, steps: int = 12) -> None:
         self._steps = steps
-        self._x = np.zeros(0)
+        self._x = np.zeros((0, 0))
         self._topology = -1
 
     def estimate(
-        self, model: ElasticModel, free: np.ndarray, nodes: np.ndarray, load: np.ndarray
-    ) -> float:
+        self,
+        model: ElasticModel,
+        free: np.ndarray,
+        nodes: np.ndarray,
+        weights: np.ndarray,
+        axes: np.ndarray,
+    ) -> np.ndarray:
         """Refines and returns the compliance.
 
         Args:
             model: the elastic model.
             free: True where a coordinate can move, shape (3 n,).
-            nodes: loaded nodes, shape (c,).
-            load: force on each for a unit force on the tool, shape (c, 3).
+            nodes, weights: that share the force, each once, shape (c,).
+            axes: unit vectors, square to each other, along which forces act, shape (d, 3).
 
         Returns:
-            Displacement along the unit force for 1 N [m/N].
+            Displacement along axis i for 1 N along axis j [m/N], positive semidefinite,
+            shape (d, d).
         """
         size = 3 * model.mesh.node_count
-        if model.mesh.topology != self._topology or len(self._x) != size:
-            self._x = np.zeros(size)
+        if model.mesh.topology != self._topology or self._x.shape != (len(axes), size):
+            self._x = np.zeros((len(axes), size))
             self._topology = model.mesh.topology
-        b = np.zeros(size)
-        np.add.at(b.reshape(-1, 3), nodes, load)
-        b[~free] = 0.0
+        loads, residuals = np.zeros((2, len(axes), size))
         preconditioner = _diagonal_preconditioner(model, free)
         work = np.empty((3, size))
-        value = _conjugate_gradients(
-            model.operands(), preconditioner, b, self._x, work, self._steps
-        )
-        return max(float(value), 0.0)
+        for axis, b, x, r in zip(axes, loads, self._x, residuals, strict=True):
+            b.reshape(-1, 3)[nodes] = weights[:, None] * axis
+            b[~free] = 0.0
+            _conjugate_gradients(model.operands(), preconditioner, b, x, work, self._steps)
+            r[:] = work[0]
+        value = loads @ self._x.T + self._x @ residuals.T
+        sizes, vectors = np.linalg.eigh((value + value.T) / 2)
+        return (vectors * np.maximum(sizes, 0.0)) @ vectors.T

@@ -28,7 +28,8 @@ class ToolContact:
     """What the haptic bridge says about the tool, see `Contact.msg`; tissue frame, [m].
 
     Attributes:
-        nodes, weights: that share the load, each once, shape (c,).
+        nodes, weights: that share the load, each once, shape (c,). Where nothing is touched: those
+            of the point that a touch would meet first, or none.
         offset: from the touched point to the proxy's centre [m], shape (3,).
     """
 

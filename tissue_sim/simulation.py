@@ -8,7 +8,7 @@ from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Blade, Resistance, Sweep
 from tissue_sim.compliance import PointCompliance
 from tissue_sim.contact import Command, Frame, State, ToolContact
-from tissue_sim.coupling import FREE, PUSH, Coupling
+from tissue_sim.coupling import FREE, HOLD, PUSH, Coupling
 from tissue_sim.dynamics import Dynamics, Motion, TimeStepping
 from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.guard import TOOL_SPEED
@@ -58,7 +58,6 @@ class TissueSimulation:
         self._compliance = PointCompliance()
         self._blade: Blade | None = None
         self._target: np.ndarray | None = None
-        self._load = Coupling()
         self._device: np.ndarray | None = None
         self._outstanding: Command | None = None
         self._finish_due = False
@@ -120,7 +119,7 @@ class TissueSimulation:
             frame,
             state=self.state,
             force=self._reaction(coupling, motion),
-            stiffness=self._stiffness(coupling),
+            stiffness=self._stiffness(coupling, contact),
             resistance=self._blade.limit if self._blade else 0.0,
             command=command,
             sweep=sweep,
@@ -155,40 +154,20 @@ class TissueSimulation:
             self._target = None
             return Coupling()
         coupling = self._pushed_by(contact, positions)
-        self._target = coupling.end
-        self._load = coupling
+        self._target = contact.device - contact.offset
         return coupling
 
     def _pushed_by(self, contact: ToolContact, positions: np.ndarray) -> Coupling:
-        """The spring of a contact, half of it where it was in the last frame.
+        """The spring of a contact.
 
-        A dent may tilt under the load so that the next contact is on its other side: spread over
-        two frames, the load finds the middle. Along the surface the spring starts relaxed: the
-        tissue sticks to the tool within a frame and slips between frames. Without either a soft
-        hill under the tool swings from side to side.
+        Along the surface it starts relaxed: the tissue sticks to the tool within a frame and slips
+        between frames.
         """
-        coupling = Coupling(
-            mode=PUSH,
-            nodes=contact.nodes,
-            weights=contact.weights,
-            end=contact.device - contact.offset,
-            normal=contact.normal,
-            stiffness=contact.stiffness,
-        )
-        if self._target is None:
-            start = coupling.point(positions)
-        else:
-            start = self._target
-            before = coupling.point(positions)
-            nodes, slots = np.unique(
-                np.concatenate([coupling.nodes, self._load.nodes]), return_inverse=True
-            )
-            shares = np.concatenate([coupling.weights, self._load.weights]) / 2
-            coupling.nodes, coupling.weights = nodes, np.bincount(slots, shares, len(nodes))
-            coupling.end = coupling.end + coupling.point(positions) - before
-        coupling.start = coupling.end + contact.normal * float(
-            (start - coupling.end) @ contact.normal
-        )
+        coupling, n = _spring_of(contact), contact.normal
+        point = coupling.point(positions)
+        start = point if self._target is None else self._target
+        coupling.start = point + n * float((start - point) @ n)
+        coupling.end = point + n * float((coupling.end - point) @ n)
         return coupling
 
     def _decide(
@@ -255,15 +234,29 @@ class TissueSimulation:
             internal = internal + self.material.beta * viscous[coupling.nodes]
         return np.asarray(-internal.sum(axis=0))
 
-    def _stiffness(self, coupling: Coupling) -> np.ndarray:
-        if coupling.mode != PUSH:
-            return np.zeros((3, 3)) if coupling.mode == FREE else coupling.stiffness * np.eye(3)
-        n = coupling.normal
-        load = np.outer(coupling.weights, n)
-        soft = self._compliance.estimate(
-            self.model, self.dynamics.inverse_mass > 0, coupling.nodes, load
+    def _stiffness(self, coupling: Coupling, contact: ToolContact | None) -> np.ndarray:
+        """Of tissue and coupling spring in series [N/m], shape (3, 3).
+
+        A tool that comes near is told already: the first touch is then felt as stiff as the rest.
+        """
+        spring = coupling
+        if spring.mode == FREE:
+            if contact is None or not self._foreseen(contact):
+                return np.zeros((3, 3))
+            spring = _spring_of(contact)
+        axes = np.eye(3) if spring.mode == HOLD else spring.normal[None]
+        free = self.dynamics.inverse_mass > 0
+        soft = self._compliance.estimate(self.model, free, spring.nodes, spring.weights, axes)
+        return axes.T @ np.linalg.inv(np.eye(len(axes)) / spring.stiffness + soft) @ axes
+
+    def _foreseen(self, contact: ToolContact) -> bool:
+        return (
+            self._blade is None
+            and contact.state == State.NONE
+            and contact.topology == self.mesh.topology
+            and len(contact.nodes) > 0
+            and contact.stiffness > 0
         )
-        return np.outer(n, n) / (1.0 / coupling.stiffness + soft)
 
     def apply_cut(self, delta: TopologyDelta) -> Touched:
         """Carries a change of connectivity out; displacement and velocity are interpolated.
@@ -293,3 +286,15 @@ class TissueSimulation:
             self._finish_due = True
         elif failed == Command.ADVANCE and self._blade is not None:
             self._blade.unswept()
+
+
+def _spring_of(contact: ToolContact) -> Coupling:
+    """The spring that pushes where the tool touches, or would; its start is still open."""
+    return Coupling(
+        mode=PUSH,
+        nodes=contact.nodes,
+        weights=contact.weights,
+        end=contact.device - contact.offset,
+        normal=contact.normal,
+        stiffness=contact.stiffness,
+    )

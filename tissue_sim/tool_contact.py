@@ -27,7 +27,7 @@ def tool_contact(message: Any, node_count: int) -> ToolContact:
         raise ValueError(f'coupling_stiffness {message.coupling_stiffness} is not in 0 to 1e5 N/m')
     if not 0 <= message.proxy_radius <= 0.1:
         raise ValueError(f'proxy_radius {message.proxy_radius} is not in 0 to 0.1 m')
-    if message.state == State.TOUCHING:
+    if message.state == State.TOUCHING or message.weights.any():
         if message.nodes.max() >= node_count:
             raise ValueError(f'nodes {message.nodes.tolist()} go beyond the {node_count} nodes')
         if abs(message.weights.sum() - 1) > 1e-6 or message.weights.min() < -1e-6:

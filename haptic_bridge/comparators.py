@@ -1,0 +1,252 @@
+"""What the proxy is compared with: the penalty method and the god-object, behind its interface.
+
+They are here to be seen to fail (docs/haptics.md); a scene chooses them by `haptics.contact`.
+"""
+
+import numpy as np
+from numba import njit
+
+from haptic_bridge.inside import LARGEST_FAN, is_inside
+from haptic_bridge.neighbourhood import CAPACITY, gather, refresh
+from haptic_bridge.proxy import Proxy, Touch
+from haptic_bridge.proxy_kernels import STATE
+from haptic_bridge.surface import Geometry, Surface
+
+_SKIN = 1e-7
+"""[m] by which the god-object stays above its planes, so that rounding drops it through none."""
+_ROUNDS = 4
+
+
+class Penalty:
+    """The penalty method (thesis 6.1.1): out by the nearest way, whatever the way in was.
+
+    Limitations: forgets where the tool came from, so it pops through what is thinner than twice the
+    depth, and its direction flips where two sides are equally near.
+
+    Args:
+        radius: of the sphere [m].
+    """
+
+    def __init__(self, radius: float) -> None:
+        self.radius = radius
+        self._state = np.zeros(1, STATE)
+        self.touch = Touch(self._state)
+
+    def reset(self) -> None:
+        """There is nothing to forget."""
+
+    def step(self, surface: Surface, blend: float, device: np.ndarray) -> Touch:
+        """Finds the nearest way out, see `Proxy.step`."""
+        _step_out(surface.geometry, blend, np.asarray(device, float), self.radius, self._state)
+        return self.touch
+
+
+class GodObject:
+    """A point that triangles hold back on its way to the device (Zilles and Salisbury 1995).
+
+    Up to three planes that the straight way would cross hold it; of these it takes the point that
+    is nearest to the device.
+
+    Limitations: a point without radius, so it touches later than the sphere by the radius; it
+    follows no moving surface, and what passes over it has lost it; it can slip through the gap
+    between triangles that round-off leaves.
+
+    Args:
+        radius: not used; here for the common interface [m].
+    """
+
+    def __init__(self, radius: float) -> None:
+        self.radius = radius
+        self._state = np.zeros(1, STATE)
+        self._state['nodes'] = -1
+        self.touch = Touch(self._state)
+
+    def reset(self) -> None:
+        """Starts at the device."""
+        self._state['placed'] = False
+
+    def step(self, surface: Surface, blend: float, device: np.ndarray) -> Touch:
+        """Moves the god-object towards the device, see `Proxy.step`."""
+        _follow(surface.geometry, blend, np.asarray(device, float), self._state)
+        return self.touch
+
+
+CONTACTS: dict[str, type[Proxy] | type[Penalty] | type[GodObject]] = {
+    'proxy': Proxy,
+    'penalty': Penalty,
+    'god_object': GodObject,
+}
+
+
+@njit(cache=True, nogil=True)
+def _write(surface: Geometry, slot: int, weights: np.ndarray, state: np.ndarray) -> None:
+    """Names a triangle of the neighbourhood and the point of it with the given weights."""
+    s = state[0]
+    near = s.near[0]
+    s.nodes[:] = 0
+    s.weights[:] = 0.0
+    s.contact[:] = 0.0
+    s.spread = 0.0
+    for j in range(3):
+        s.nodes[j] = surface.triangles[near.triangle[slot], j]
+        s.weights[j] = weights[j]
+        s.spread += weights[j] * weights[j]
+        for axis in range(3):
+            s.contact[axis] += weights[j] * near.corners[slot, j, axis]
+
+
+@njit(cache=True, nogil=True)
+def _step_out(
+    surface: Geometry, blend: float, device: np.ndarray, radius: float, state: np.ndarray
+) -> None:
+    s = state[0]
+    near = s.near[0]
+    s.touching = False
+    s.depth = 0.0
+    s.position[:] = device
+    s.weights[:] = 0.0
+    gather(surface, blend, device, np.inf, LARGEST_FAN, s.near)
+    if near.count == 0:
+        return
+    slot = near.order[0]
+    inside = is_inside(surface, device, s.near, s.step)
+    gap = near.distance[slot]
+    if not inside and gap <= 1e-12:
+        return
+    for axis in range(3):
+        s.normal[axis] = s.step[axis]
+        if gap > 1e-12:
+            s.normal[axis] = (device[axis] - near.closest[slot, axis]) / gap
+            s.normal[axis] *= -1.0 if inside else 1.0
+    _write(surface, slot, near.weights[slot], state)
+    height = -gap if inside else gap
+    if height >= radius:
+        return
+    s.touching = True
+    s.depth = radius - height
+    for axis in range(3):
+        s.position[axis] = device[axis] + s.depth * s.normal[axis]
+
+
+@njit(cache=True, nogil=True)
+def _follow(surface: Geometry, blend: float, device: np.ndarray, state: np.ndarray) -> None:
+    s = state[0]
+    near, goal, p = s.near[0], s.goal, s.position
+    if not s.placed:
+        p[:] = device
+        s.placed = True
+    s.touching = False
+    s.depth = 0.0
+    length = 0.0
+    for axis in range(3):
+        goal[axis] = 0.5 * (p[axis] + device[axis])
+        length += (device[axis] - p[axis]) ** 2
+    length = np.sqrt(length)
+    gather(surface, blend, goal, 1.5 * length + 1e-6, CAPACITY, s.near)
+    goal[:] = device
+    planes = np.empty((3, 3))
+    slots = np.empty(3, np.int64)
+    held = 0
+    weights = np.empty(3)
+    for _ in range(_ROUNDS):
+        slot = _first_crossed(p, goal, slots, held, weights, s.near)
+        if slot < 0 or held == 3:
+            break
+        planes[held] = near.normal[slot]
+        slots[held] = slot
+        held += 1
+        goal[:] = _nearest_on(p, device, planes, held, slots, s.near)
+    if held == 0:
+        p[:] = device
+        return
+    if slot < 0:
+        p[:] = goal
+    depth = 0.0
+    for axis in range(3):
+        s.step[axis] = p[axis] - device[axis]
+        depth += s.step[axis] ** 2
+    s.depth = np.sqrt(depth)
+    if s.depth <= 1e-9:
+        return
+    s.touching = True
+    for axis in range(3):
+        s.normal[axis] = s.step[axis] / s.depth
+    refresh(p, s.near)
+    _write(surface, slots[0], near.weights[slots[0]], state)
+
+
+@njit(cache=True, nogil=True)
+def _first_crossed(
+    start: np.ndarray,
+    end: np.ndarray,
+    slots: np.ndarray,
+    held: int,
+    weights: np.ndarray,
+    nears: np.ndarray,
+) -> int:
+    """The triangle that the straight way from start to end meets first from outside, or -1."""
+    near = nears[0]
+    best, found = 1.0 + 1e-9, -1
+    for place in range(near.count):
+        slot = near.order[place]
+        known = False
+        for i in range(held):
+            known = known or slots[i] == slot
+        n, corners = near.normal[slot], near.corners[slot]
+        above = below = 0.0
+        for axis in range(3):
+            above += n[axis] * (start[axis] - corners[0, axis])
+            below += n[axis] * (end[axis] - corners[0, axis])
+        if known or below >= 0.5 * _SKIN or above < -_SKIN or above - below <= 1e-15:
+            continue
+        t = max(above, 0.0) / (above - below)
+        if t >= best or not _is_within(start, end, t, corners, n):
+            continue
+        best, found = t, slot
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _is_within(
+    start: np.ndarray, end: np.ndarray, t: float, corners: np.ndarray, n: np.ndarray
+) -> bool:
+    """Whether the point at t of the way lies within a triangle of normal n."""
+    for i in range(3):
+        a, b = corners[i], corners[(i + 1) % 3]
+        e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        q0 = start[0] + t * (end[0] - start[0]) - a[0]
+        q1 = start[1] + t * (end[1] - start[1]) - a[1]
+        q2 = start[2] + t * (end[2] - start[2]) - a[2]
+        side = n[0] * (e1 * q2 - e2 * q1) + n[1] * (e2 * q0 - e0 * q2) + n[2] * (e0 * q1 - e1 * q0)
+        if side < -1e-12:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _nearest_on(
+    start: np.ndarray,
+    device: np.ndarray,
+    planes: np.ndarray,
+    held: int,
+    slots: np.ndarray,
+    nears: np.ndarray,
+) -> np.ndarray:
+    """The point nearest to the device on all held planes, by Lagrange multipliers."""
+    near = nears[0]
+    system = np.zeros((held, held))
+    wanted = np.zeros(held)
+    for i in range(held):
+        for axis in range(3):
+            wanted[i] += planes[i, axis] * (near.corners[slots[i], 0, axis] - device[axis])
+        wanted[i] += _SKIN
+        for j in range(held):
+            for axis in range(3):
+                system[i, j] += planes[i, axis] * planes[j, axis]
+        system[i, i] += 1e-9
+    multipliers = np.linalg.solve(system, wanted)
+    point = device.copy()
+    for i in range(held):
+        for axis in range(3):
+            point[axis] += multipliers[i] * planes[i, axis]
+    return point

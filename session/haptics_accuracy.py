@@ -1,0 +1,391 @@
+"""How right the force is between two frames: the command `trainer haptics-accuracy`.
+
+The same tool path goes through the force path over a tissue at 30 Hz, by each law of extrapolation,
+and through a simulation that runs the tissue itself at 1 kHz, without any extrapolation.
+"""
+
+import csv
+import os
+from collections.abc import Callable
+from dataclasses import astuple, dataclass, fields
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from cutting.methods import make_method
+from haptic_bridge.force_path import ForcePath
+from haptic_bridge.ground import Ground
+from haptic_bridge.proxy import Proxy
+from haptic_bridge.settings import HapticsSettings
+from haptic_bridge.surface import Surface
+from session.errors import SessionError
+from session.in_process import TICK, InProcess, LinkSettings, Tissue
+from session.scene import Scene, load_scene
+from tissue_sim.blade import Resistance
+from tissue_sim.contact import State, ToolContact
+from tissue_sim.dynamics import TimeStepping
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh
+from tissue_sim.mesh_io import load_tissue
+from tissue_sim.simulation import TissueSimulation
+
+Floats = NDArray[np.float64]
+
+LAWS = ('constant', 'time', 'position', 'local_stiffness')
+PLACES = ((-0.020, 0.018), (0.0, 0.0))
+"""Where the liver is palpated: x and y [m]."""
+FRAME_RATE = 30.0
+_ENCODER = 2e-5
+_LEAD = 0.5
+"""[s] of the way down, which does not count."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A way of the tool over the liver.
+
+    Attributes:
+        name: of it.
+        path: heights over the touch and way along x by time [s]: `path(t)` gives two arrays [m].
+        seconds: after the way down.
+        cuts: the blade may go in.
+        bar: largest p95 that the default may have, in per cent of the peak; 0: none is set.
+    """
+
+    name: str
+    path: Callable[[Floats], tuple[Floats, Floats]]
+    seconds: float
+    cuts: bool = False
+    bar: float = 0.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One law on one motion; errors in per cent of the peak force of the 1 kHz simulation."""
+
+    motion: str
+    law: str
+    peak_newton: float
+    median: float
+    p95: float
+    worst: float
+    largest_jump: float
+    jump_of_1_khz: float
+
+
+def _wave(hertz: float, least: float, most: float) -> Callable[[Floats], tuple[Floats, Floats]]:
+    def path(t: Floats) -> tuple[Floats, Floats]:
+        return -(least + (most - least) * (0.5 - 0.5 * np.cos(2 * np.pi * hertz * t))), 0 * t
+
+    return path
+
+
+def _slide(hertz: float, depth: float, reach: float) -> Callable[[Floats], tuple[Floats, Floats]]:
+    def path(t: Floats) -> tuple[Floats, Floats]:
+        return 0 * t - depth, reach * np.sin(2 * np.pi * hertz * t)
+
+    return path
+
+
+def _cut(t: Floats) -> tuple[Floats, Floats]:
+    down = np.interp(t, [0.0, 1.0, 3.0, 3.6], [0.0, -0.016, -0.016, 0.010])
+    return down, np.interp(t, [1.0, 2.8], [0.0, 0.025])
+
+
+MOTIONS = (
+    Motion('palpation 0.5 Hz', _wave(0.5, 0.001, 0.006), 2.0, bar=7.0),
+    Motion('palpation 1 Hz', _wave(1.0, 0.001, 0.006), 2.0, bar=7.0),
+    Motion('palpation 2 Hz', _wave(2.0, 0.001, 0.006), 1.0, bar=10.0),
+    Motion('sliding 1 Hz', _slide(1.0, 0.005, 0.005), 2.0, bar=7.0),
+    Motion('sliding 2 Hz', _slide(2.0, 0.005, 0.005), 1.0, bar=10.0),
+    Motion('tapping 1 Hz', _wave(1.0, -0.003, 0.005), 2.0),
+    Motion('tapping 2 Hz', _wave(2.0, -0.003, 0.005), 1.0),
+    Motion('cutting', _cut, 3.8, cuts=True),
+)
+
+
+class Bench:
+    """Scene, tissue and tool paths of all runs.
+
+    Args:
+        scene: of which tissue and tool are taken.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._mesh = load_tissue(scene.tissue)
+
+    def tissue(self, rate: float, cuts: bool) -> Tissue:
+        """The scene's tissue at a rate [Hz]; a blade gets in only if it may."""
+        settings = self.scene.tissue
+        m, d = settings.material, settings.damping
+        simulation = TissueSimulation(
+            TetMesh(*self._mesh),
+            Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
+            Resistance(settings.cut_threshold if cuts else 1e3, m.toughness, m.blade_friction),
+            model=settings.model,
+            stepping=TimeStepping(
+                settings.integrator,
+                rate=rate,
+                safety=settings.integration.safety,
+                max_substeps=settings.integration.max_substeps,
+            ),
+        )
+        return Tissue(simulation, make_method(self.scene.cutting) if cuts else None)
+
+    def path(self, motion: Motion, place: tuple[float, float]) -> Floats:
+        """Tips by tick [m], shape (k, 3): down to where the motion begins, and through it."""
+        t = np.arange(round((_LEAD + motion.seconds) / TICK)) * TICK
+        part = np.clip(t / _LEAD, 0, 1)
+        part = part**3 * (10 - 15 * part + 6 * part * part)
+        height, along = motion.path(np.maximum(t - _LEAD, 0.0))
+        height = (1 - part) * 0.002 + part * height
+        top = self._touch(place)
+        x, y = place
+        return np.column_stack([x + along, np.full_like(t, y), top + height])
+
+    def _touch(self, place: tuple[float, float]) -> float:
+        """Height at which a tip that comes down first touches [m]."""
+        simulation = self.tissue(FRAME_RATE, cuts=False).simulation
+        surface = _surface(simulation, None)
+        proxy = Proxy(self.scene.tool.radius)
+        top = float(simulation.positions[:, 2].max()) + 0.01
+        for height in np.arange(top, 0.0, -1e-4):
+            if proxy.step(surface, 1.0, np.array([*place, height])).touching:
+                return float(height)
+        raise SessionError(f'there is no tissue at x {place[0]} m, y {place[1]} m')
+
+    def reference(self, path: Floats, cuts: bool) -> Floats:
+        """Forces on the tool with the tissue at 1 kHz [N], shape (k, 3)."""
+        tissue, tool = self.tissue(1 / TICK, cuts), self.scene.tool
+        simulation, proxy, ground = tissue.simulation, Proxy(tool.radius), Ground()
+        surface: Surface | None = None
+        state = State.NONE
+        forces = np.zeros_like(path)
+        for i, tip in enumerate(path):
+            now = i * 1_000_000
+            surface = _surface(simulation, surface)
+            ground.follow(now, surface)
+            assert ground.surface is not None
+            if state == State.INSIDE:
+                proxy.reset()
+                ground.release()
+            touch = proxy.step(ground.surface, 1.0, tip)
+            touched = state if state == State.INSIDE else State(int(touch.touching))
+            if touched == State.TOUCHING:
+                ground.press()
+            elif touched == State.NONE:
+                ground.answered_free(now, simulation.step)
+            nodes, slots = np.unique(np.maximum(touch.nodes, 0), return_inverse=True)
+            frame = tissue.frame(
+                ToolContact(
+                    state=touched,
+                    topology=simulation.mesh.topology,
+                    nodes=nodes,
+                    weights=np.bincount(slots, touch.weights, len(nodes)),
+                    device=tip.copy(),
+                    offset=touch.position - touch.contact,
+                    normal=touch.normal.copy(),
+                    stiffness=tool.coupling_stiffness,
+                    radius=tool.radius,
+                    blade_root=tip + tool.blade_root,
+                    blade_tip=tip + tool.blade_tip,
+                )
+            )
+            forces[i], state = frame.force, frame.state
+        return forces
+
+    def rendered(
+        self, path: Floats, cuts: bool, link: LinkSettings | None = None, **haptics: object
+    ) -> Floats:
+        """Forces that the force path commands over a tissue at 30 Hz [N], shape (k, 3)."""
+        scene = self.scene
+        settings = scene.haptics.model_copy(update={'soft_start': 0.0, **haptics})
+        force_path = ForcePath(scene.tool, scene.device, settings, scene.profile)
+        session = InProcess(force_path, self.tissue(FRAME_RATE, cuts), FRAME_RATE, link)
+        frame = scene.device.tissue_from_device
+        forces = np.zeros_like(path)
+        for i, tip in enumerate(path):
+            pose = np.round(frame.to_device(tip) / _ENCODER) * _ENCODER
+            forces[i] = frame.rotation() @ session.tick(pose).wrench[:3]
+        return forces
+
+
+def _surface(simulation: TissueSimulation, previous: Surface | None) -> Surface:
+    return Surface(
+        simulation.positions,
+        simulation.mesh.triangles,
+        revision=simulation.step,
+        topology=simulation.mesh.topology,
+        previous=previous,
+    )
+
+
+def compare(name: str) -> list[Row]:
+    """A motion, by its name in `MOTIONS`, at all places by all laws."""
+    motion = next(motion for motion in MOTIONS if motion.name == name)
+    bench = Bench(load_scene('liver'))
+    paths = [bench.path(motion, place) for place in PLACES]
+    truths = [bench.reference(path, motion.cuts) for path in paths]
+    rows = []
+    for law in LAWS:
+        forces = [bench.rendered(path, motion.cuts, extrapolation=law) for path in paths]
+        rows.append(_row(motion, law, truths, forces))
+    return rows
+
+
+def _row(motion: Motion, law: str, truths: list[Floats], forces: list[Floats]) -> Row:
+    skip = round(_LEAD / TICK)
+    peaks = [float(np.linalg.norm(t, axis=1).max()) for t in truths]
+    errors = np.concatenate(
+        [
+            np.linalg.norm(f - t, axis=1)[skip:] / peak
+            for f, t, peak in zip(forces, truths, peaks, strict=True)
+        ]
+    )
+    return Row(
+        motion.name,
+        law,
+        max(peaks),
+        100 * float(np.median(errors)),
+        100 * float(np.percentile(errors, 95)),
+        100 * float(errors.max()),
+        100 * max(_jump(f, skip) / p for f, p in zip(forces, peaks, strict=True)),
+        100 * max(_jump(t, skip) / p for t, p in zip(truths, peaks, strict=True)),
+    )
+
+
+def _jump(forces: Floats, skip: int) -> float:
+    """Largest difference of two forces in succession [N]."""
+    return float(np.linalg.norm(np.diff(forces, axis=0), axis=1)[skip:].max())
+
+
+@dataclass(frozen=True)
+class Energy:
+    """What the hand puts in over tapping at 1 Hz, net.
+
+    Attributes:
+        name: of the force.
+        trace: by tick [J], shape (k,).
+        by_cycle: mean of a cycle [J]; negative: the hand got more than it gave.
+        stored: most in a cycle [J].
+    """
+
+    name: str
+    trace: Floats
+    by_cycle: float
+    stored: float
+
+
+def energies() -> list[Energy]:
+    """Of the 1 kHz simulation, of two forces and of one, without and with delay."""
+    bench = Bench(load_scene('liver'))
+    motion = Motion('tapping', _wave(1.0, -0.003, 0.005), 3.0)
+    path = bench.path(motion, PLACES[0])
+    late = LinkSettings(delay=0.05)
+    forces = {'tissue at 1 kHz': bench.reference(path, cuts=False)}
+    for name, link in (('', None), (', 50 ms each way', late)):
+        for kind in ('two', 'one'):
+            forces[f'{kind} force{"s" * (kind == "two")}{name}'] = bench.rendered(
+                path, False, link, forces=kind, max_damping=0.0
+            )
+    held = bench.rendered(path, False, extrapolation='constant', max_damping=0.0)
+    forces['two forces, held (constant)'] = held
+    return [_energy(name, path, force) for name, force in forces.items()]
+
+
+def _energy(name: str, path: Floats, force: Floats) -> Energy:
+    moved = np.diff(path, axis=0)
+    trace = np.concatenate([[0.0], np.cumsum(-np.einsum('ij,ij->i', force[:-1], moved))])
+    cycle, skip = round(1 / TICK), round(_LEAD / TICK)
+    cycles = (len(path) - skip) // cycle
+    ends = trace[skip : skip + cycles * cycle + 1 : cycle]
+    if len(ends) <= cycles:
+        ends = np.append(ends, trace[-1])
+    return Energy(
+        name, trace, float(np.diff(ends).mean()), float(np.ptp(trace[skip : skip + cycle]))
+    )
+
+
+def run_accuracy(folder: Path) -> list[str]:
+    """Runs all; writes the table, the picture of the energies, and the table in haptics.md.
+
+    Args:
+        folder: that exists and has haptics.md.
+
+    Returns:
+        Where the default misses its bar, in sentences.
+
+    Raises:
+        SessionError: there is no such page.
+    """
+    from session.haptics_pictures import draw_energies
+
+    page = folder / 'haptics.md'
+    if not page.is_file():
+        raise SessionError(f'{page} is not there: the tables go into it')
+    console = Console(highlight=False)
+    rows: list[Row] = []
+    with console.status('') as line, get_context('spawn').Pool(os.cpu_count() or 1) as pool:
+        tapped = pool.apply_async(energies)
+        for motion in pool.imap(compare, [motion.name for motion in MOTIONS], chunksize=1):
+            rows += motion
+            line.update(f'{rows[-1].motion} is done')
+        budget = tapped.get()
+    with (folder / 'haptics-accuracy.csv').open('w', newline='', encoding='utf-8') as out:
+        table = csv.writer(out, lineterminator='\n')
+        table.writerow([field.name for field in fields(Row)])
+        for row in rows:
+            table.writerow([x if isinstance(x, str) else f'{x:.4g}' for x in astuple(row)])
+    draw_energies(folder / 'images' / 'haptics-energy.png', budget)
+    text = page.read_text(encoding='utf-8')
+    text = _between(text, 'errors', _errors_table(rows))
+    page.write_text(_between(text, 'energies', _energies_table(budget)), encoding='utf-8')
+    console.print(f'{page} has {len(rows)} rows of errors')
+    return missed(rows)
+
+
+def missed(rows: list[Row]) -> list[str]:
+    """Where the default misses its bar."""
+    bars = {motion.name: motion.bar for motion in MOTIONS}
+    default = HapticsSettings().extrapolation
+    return [
+        f'{row.motion}: p95 of {row.law} is {row.p95:.1f} %, the bar is {bars[row.motion]:g} %'
+        for row in rows
+        if row.law == default and 0 < bars[row.motion] < row.p95
+    ]
+
+
+def _errors_table(rows: list[Row]) -> str:
+    lines = [
+        '| motion | extrapolation | median | p95 | worst | largest jump |',
+        '|---|---|---:|---:|---:|---:|',
+    ]
+    for row in rows:
+        cells = (row.median, row.p95, row.worst, row.largest_jump)
+        numbers = ' | '.join(f'{cell:.1f}' for cell in cells)
+        lines.append(f'| {row.motion} | `{row.law}` | {numbers} |')
+    return '\n'.join(lines)
+
+
+def _energies_table(budget: list[Energy]) -> str:
+    lines = ['| force | stored by a tap | net by cycle |', '|---|---:|---:|']
+    for e in budget:
+        share = 100 * e.by_cycle / e.stored
+        what = 'lost' if share >= 0 else 'made'
+        lines.append(f'| {e.name} | {1e3 * e.stored:.2f} mJ | {abs(share):.1f} % {what} |')
+    return '\n'.join(lines)
+
+
+def _between(text: str, name: str, table: str) -> str:
+    """The text with what stands between two marks replaced."""
+    start, end = f'<!-- {name} -->', f'<!-- end of {name} -->'
+    if start not in text or end not in text:
+        raise SessionError(
+            f'haptics.md has no marks {start} and {end}: the table goes between them'
+        )
+    before, after = text.split(start)[0], text.split(end)[1]
+    return f'{before}{start}\n\n{table}\n\n{end}{after}'

@@ -1,0 +1,222 @@
+"""Tissue, force loop and the way between them in one process and in a time of its own.
+
+Nothing here waits and nothing is random but by seed, so a session gives the same bits again. What
+the nodes and their messages do in the graph is done here with the same cores: the contact that is
+newest when a frame begins loads it, and its force and surface arrive when it has been computed.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cutting.method import CutMethod
+from haptic_bridge.force_path import ForcePath, Tick
+from haptic_bridge.operating_state import State
+from haptic_bridge.surface import Surface
+from haptic_bridge.wire import ContactCodec, Sample
+from tissue_sim.contact import Command, Frame, ToolContact
+from tissue_sim.contact import State as ToolState
+from tissue_sim.simulation import TissueSimulation
+
+TICK = 0.001
+"""[s] of the force loop."""
+_NS = 1_000_000
+_START_NS = 10**9
+_PLACES = ContactCodec.fields
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """The way between the force loop and the tissue, the same in both directions.
+
+    Attributes:
+        delay: [s] of each direction.
+        loss: share of the messages that never arrive, each direction.
+        compute: [s] from the beginning of a frame to its answer.
+        seed: of the loss.
+    """
+
+    delay: float = 0.0
+    loss: float = 0.0
+    compute: float = 0.010
+    seed: int = 0
+
+
+class _Channel:
+    """Hands messages over in order, later, and some of them never."""
+
+    def __init__(self, delay: float, loss: float, random: np.random.Generator) -> None:
+        self._ticks = round(delay / TICK)
+        self._loss = loss
+        self._random = random
+        self._queue: deque[tuple[int, Any]] = deque()
+
+    def send(self, tick: int, message: Any) -> None:
+        if self._random.random() >= self._loss:
+            self._queue.append((tick + self._ticks, message))
+
+    def arrived(self, tick: int) -> list[Any]:
+        messages = []
+        while self._queue and self._queue[0][0] <= tick:
+            messages.append(self._queue.popleft()[1])
+        return messages
+
+
+class Tissue:
+    """The simulation with its cuts answered one frame later, as `tissue_sim` and `cutting` do it.
+
+    Args:
+        simulation: of the tissue.
+        method: of cutting; None: nothing is cut.
+    """
+
+    def __init__(self, simulation: TissueSimulation, method: CutMethod | None = None) -> None:
+        self.simulation = simulation
+        self._method = method
+        self._asked: Frame | None = None
+
+    def frame(self, contact: ToolContact | None) -> Frame:
+        """One frame under a contact."""
+        self._answer()
+        frame = self.simulation.frame(contact)
+        if frame.command is not None:
+            self._asked = frame
+        return frame
+
+    def _answer(self) -> None:
+        if self._asked is None:
+            return
+        asked, self._asked = self._asked, None
+        simulation = self.simulation
+        if self._method is None:
+            simulation.cut_failed()
+            return
+        positions = simulation.positions
+        if asked.command is Command.FINISH or asked.sweep is None:
+            result = self._method.finish(simulation.mesh, positions)
+        else:
+            result = self._method.advance(simulation.mesh, positions, asked.sweep)
+        if result.delta.empty:
+            simulation.cut_done()
+        else:
+            simulation.apply_cut(result.delta)
+
+
+def tool_contact(values: Sequence[float]) -> ToolContact:
+    """What `Contact` says, from the numbers of a tick, as `tissue_sim.messages` reads it."""
+
+    def get(name: str) -> np.ndarray:
+        return np.array(values[_PLACES[name]], float)
+
+    nodes, slots = np.unique(get('nodes').astype(np.int64), return_inverse=True)
+    weights = np.bincount(slots, get('weights'), len(nodes))
+    return ToolContact(
+        state=ToolState(int(get('state')[0])),
+        topology=int(get('topology')[0]),
+        nodes=nodes[weights > 0],
+        weights=weights[weights > 0],
+        device=get('device'),
+        offset=get('proxy') - get('point'),
+        normal=get('normal'),
+        stiffness=float(get('coupling_stiffness')[0]),
+        radius=float(get('proxy_radius')[0]),
+        blade_root=get('blade_root'),
+        blade_tip=get('blade_tip'),
+        sequence=int(get('sequence')[0]),
+    )
+
+
+class InProcess:
+    """A force loop at 1 kHz and a tissue at its own rate, with a link between them.
+
+    Args:
+        path: the force loop.
+        tissue: under it.
+        rate: of the tissue [Hz].
+        link: between the two.
+
+    Attributes:
+        frame: newest of the tissue, None before the first.
+        ticks: that have passed.
+    """
+
+    def __init__(
+        self, path: ForcePath, tissue: Tissue, rate: float, link: LinkSettings | None = None
+    ) -> None:
+        link = link or LinkSettings()
+        random = np.random.default_rng(link.seed)
+        self.path = path
+        self.tissue = tissue
+        self.frame: Frame | None = None
+        self.ticks = 0
+        self._rate = rate
+        self._up = _Channel(link.delay, link.loss, random)
+        self._down = _Channel(link.delay + link.compute, link.loss, random)
+        self._frames = 0
+        self._newest: tuple[int, tuple[float, ...]] | None = None
+        self._latest: Surface | None = None
+        self._surface = self._surface_now()
+        self._sample: Sample | None = None
+
+    def tick(
+        self,
+        position: np.ndarray,
+        orientation: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0, 1.0),
+    ) -> Tick:
+        """One period of the force loop with the device at a pose.
+
+        Args:
+            position: [m], device frame, shape (3,).
+            orientation: quaternion x y z w.
+        """
+        now = _START_NS + self.ticks * _NS
+        for surface, sample in self._down.arrived(self.ticks):
+            self._surface, self._sample = surface, sample
+        pose = Sample(now, '', (*map(float, position), *orientation))
+        out = self.path.tick(
+            now, state=State.ENABLED, pose=pose, sample=self._sample, surface=self._surface
+        )
+        if out.fault:
+            raise RuntimeError(f'tick {self.ticks}: {out.fault}')
+        self._sample = None
+        self._up.send(self.ticks, (out.contact_stamp_ns, out.contact))
+        self.ticks += 1
+        if self.ticks * TICK * self._rate >= self._frames + 1 - 1e-9:
+            self._simulate()
+        return out
+
+    def _simulate(self) -> None:
+        self._frames += 1
+        for message in self._up.arrived(self.ticks):
+            self._newest = message
+        stamp, values = self._newest or (0, None)
+        contact = tool_contact(values) if values is not None else None
+        frame = self.tissue.frame(contact)
+        self.frame = frame
+        if frame.diverged:
+            return
+        surface = self._surface_now()
+        sequence = contact.sequence if contact is not None else 0
+        self._down.send(self.ticks, (surface, self._sample_of(frame, sequence, stamp)))
+
+    def _surface_now(self) -> Surface:
+        simulation = self.tissue.simulation
+        self._latest = Surface(
+            simulation.positions,
+            simulation.mesh.triangles,
+            revision=simulation.step,
+            topology=simulation.mesh.topology,
+            previous=self._latest,
+        )
+        return self._latest
+
+    def _sample_of(self, frame: Frame, sequence: int, stamp: int) -> Sample:
+        topology = self.tissue.simulation.mesh.topology
+        head = (frame.step, frame.step, topology, sequence, *divmod(stamp, 10**9))
+        vectors = np.concatenate([frame.position, frame.force, frame.stiffness.ravel()])
+        tail = (frame.resistance, frame.kinetic_energy, frame.elastic_energy)
+        end = _START_NS + self.ticks * _NS
+        return Sample(end, 'tissue', (*head, int(frame.state), *vectors.tolist(), *tail))
