@@ -12,52 +12,18 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from tissue_sim import messages, ros
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.blade import Resistance
+from tissue_sim.assembly import make_simulation
 from tissue_sim.contact import Command, Frame, ToolContact
-from tissue_sim.dynamics import TimeStepping
 from tissue_sim.errors import MeshError
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, Touched
-from tissue_sim.mesh_io import load_tissue
+from tissue_sim.mesh import Touched
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
-from tissue_sim.simulation import TissueSimulation
 from tissue_sim.timing import PeriodicLoop
 from tissue_sim.warm_up import warm_up
 
 _CONTACT_AGE_NS = 100_000_000
 _KEYFRAME_SECONDS = 5.0
 _CUT_TIMEOUT_NS = 1_000_000_000
-
-
-def make_simulation(settings: TissueSettings) -> TissueSimulation:
-    """The simulation that a scene describes.
-
-    Args:
-        settings: its section `tissue`.
-
-    Raises:
-        MeshError: the mesh cannot be used.
-    """
-    nodes, tetrahedra, fixed = load_tissue(settings)
-    m, d = settings.material, settings.damping
-    return TissueSimulation(
-        TetMesh(nodes, tetrahedra, fixed),
-        Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
-        Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
-        model=settings.model,
-        stepping=TimeStepping(
-            settings.integrator,
-            rate=settings.integration.rate,
-            safety=settings.integration.safety,
-            min_substeps=settings.integration.min_substeps,
-            max_substeps=settings.integration.max_substeps,
-            frequency_growth=settings.integration.frequency_growth,
-        ),
-        active=ActiveSettings(**settings.active_region.model_dump()),
-        stretch=settings.stretch,
-    )
 
 
 class TissueSimNode(Node):
@@ -69,7 +35,9 @@ class TissueSimNode(Node):
         self.declare_parameter('seed', 0)
         settings = read_section(scene, 'tissue', TissueSettings)
         self._scene = scene.stem
-        self._simulation = make_simulation(settings)
+        self._simulation, self._plan = make_simulation(settings)
+        self._over = ''
+        self._log_plan()
         self._loop = PeriodicLoop(settings.integration.rate)
         self._encoder = messages.DeltaEncoder(self._simulation.mesh, self._simulation.displacement)
         self._lock = threading.Lock()
@@ -83,6 +51,30 @@ class TissueSimNode(Node):
         self._next_keyframe = 0.0
         self._frame: Frame | None = None
         self._connect()
+
+    def _log_plan(self) -> None:
+        if self._plan is None:
+            return
+        log = self.get_logger()
+        for sentence in self._plan.rejected:
+            log.info(f'not {sentence}')
+        if self._plan.chosen is None:
+            log.warning(
+                f'no method fits the budget, so {self._simulation.model.name} is taken; to have '
+                f'one: {"; ".join(self._plan.remedies)}'
+            )
+        else:
+            log.info(f'method: {self._plan.chosen.name}')
+
+    def _check_plan(self, frame: Frame) -> None:
+        """Says once after a cut when the plan does not hold for the tissue any more."""
+        if self._plan is None or self._touched is None:
+            return
+        needed = frame.substeps / max(frame.slow_motion, 1e-9)
+        over = self._plan.over(needed, len(self._simulation.mesh.tetrahedra))
+        if over and not self._over:
+            self.get_logger().warning(over)
+        self._over = over
 
     def _connect(self) -> None:
         self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, ros.LATCHED)
@@ -109,6 +101,7 @@ class TissueSimNode(Node):
         self._take_answer()
         contact = self._newest_contact()
         frame = self._simulation.frame(contact)
+        self._check_plan(frame)
         now = time.time_ns()
         delta = self._encoder.encode(
             self._simulation.displacement, frame.step, now, self._touched, self._cut_step
@@ -239,6 +232,8 @@ class TissueSimNode(Node):
             return DiagnosticStatus.ERROR, f'a frame was taken back: {frame.trouble}', values
         if frame.trouble:
             return DiagnosticStatus.WARN, frame.trouble, values
+        if self._over:
+            return DiagnosticStatus.WARN, self._over, values
         if frame.slow_motion < 0.999:
             return DiagnosticStatus.WARN, 'max_substeps is too small for real time', values
         return DiagnosticStatus.OK, frame.state.name.lower(), values
