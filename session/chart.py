@@ -11,9 +11,10 @@ from rich.console import Console
 
 from session.chart_measure import Point, measure, yardstick
 from session.chart_picture import draw
-from session.chart_problems import Problem, static_problems
+from session.chart_problems import ALPHA, BETA, Problem, static_problems
 from session.chart_vibration import Vibration
 from session.errors import SessionError
+from tissue_sim.dynamics import TimeStepping
 from tissue_sim.settings import TissueSettings
 
 THESIS = ('linear', 'rk4')
@@ -61,7 +62,8 @@ def run_chart(folder: Path, *, coarse: bool = False) -> None:
     console = Console(highlight=False)
     with console.status('') as line:
         before = yardstick()
-        points = measure(line.update, coarse=coarse)
+        progress = line.update if console.is_terminal else console.print
+        points = measure(progress, coarse=coarse)
         after = yardstick()
     write_chart(folder, points, (before, after))
     console.print(f'{folder / "charts.md"}: {len(points)} points')
@@ -75,9 +77,6 @@ def write_chart(folder: Path, points: list[Point], yardsticks: tuple[float, floa
         points: of all problems.
         yardsticks: before and after [ns].
     """
-    from session.chart_problems import ALPHA, BETA
-    from tissue_sim.dynamics import TimeStepping
-
     charts = folder / 'charts'
     charts.mkdir(exist_ok=True)
     with (charts / 'points.csv').open('w', newline='') as out:
