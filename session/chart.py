@@ -32,7 +32,7 @@ is known by other means. To the right is slower, upwards is worse: a method is w
 no other lies below and to the left of it. Those are joined by the grey line. All digits are in
 [points.csv](charts/points.csv), both errors and the step included.
 
-- **CPU time** is that of one thread for one second of simulated time at {safety:.0%} of the stable
+- **CPU time** is that of one thread for one second of simulated time at {safety:g} of the stable
   step (`safety`): median of the frames after a warm-up, thread time and not the clock. On this
   machine ({machine}) one elastic force of the plain linear model took {yardstick:.1f} ns a
   tetrahedron in the same run, before and after {after:.1f}; other machines compare by that.
@@ -130,25 +130,32 @@ def _cost_of(points: list[Point], target: float) -> str:
             f'{nearest.cpu_per_second:.2g} s a second'
         )
     (model, integrator), cost = min(reached.items(), key=lambda item: item[1])
-    return f'{percent} costs {cost:.2g} s a second, with {model} by {integrator}'
+    coarsest = cost == _line(points, model, integrator)[0].cpu_per_second
+    most = 'at most ' if coarsest else ''
+    return f'{percent} costs {most}{cost:.2g} s a second, with {model} by {integrator}'
 
 
 def _plain(points: list[Point]) -> str:
-    """What plain elements would need for the error of smoothed ones."""
-    best = None
+    """What plain elements need for an error that smoothed ones have as well."""
+    found = []
     for kind in ('linear', 'corotational'):
-        plain = _cheapest(points, kind)
-        for smoothed in _cheapest(points, f'{kind}_smoothed'):
-            cost = cost_for(plain, smoothed.displacement_error, beyond=True)
-            if cost is not None and smoothed.displacement_error < plain[-1].displacement_error:
-                best = (kind, smoothed, cost / smoothed.cpu_per_second)
-    if best is None:
+        plain = _cheapest(points, kind)[-1]
+        as_near = [
+            p
+            for p in _cheapest(points, f'{kind}_smoothed')
+            if p.displacement_error <= plain.displacement_error
+        ]
+        if as_near:
+            found.append((plain, min(as_near, key=lambda p: p.cpu_per_second)))
+    if not found:
         return 'Smoothing the strains does not pay here.'
-    kind, smoothed, ratio = best
+    plain, smoothed = min(found, key=lambda pair: pair[0].displacement_error)
     return (
-        f'For the {100 * smoothed.displacement_error:.2g} % of {smoothed.model} on '
-        f'{smoothed.tetrahedra} tetrahedra plain {kind} ones would need {ratio:.0f} times the CPU '
-        'time, by the slope of their line.'
+        f'The finest plain mesh, {plain.tetrahedra} tetrahedra, reaches '
+        f'{100 * plain.displacement_error:.2g} % with {plain.model}, for '
+        f'{plain.cpu_per_second / smoothed.cpu_per_second:.2g} times the CPU time in which '
+        f'{smoothed.model} reaches {100 * smoothed.displacement_error:.2g} % with '
+        f'{smoothed.tetrahedra}.'
     )
 
 
@@ -166,23 +173,20 @@ def _line(points: list[Point], model: str, integrator: str) -> list[Point]:
     return sorted(own, key=lambda p: (p.resolution, p.cpu_per_second))
 
 
-def cost_for(line: list[Point], error: float, *, beyond: bool = False) -> float | None:
+def cost_for(line: list[Point], error: float) -> float | None:
     """CPU time at which a method reaches an error, between its meshes on the logarithmic chart.
 
     Args:
         line: the method's points, coarsest mesh first.
         error: of the displacement.
-        beyond: continue the line past its finest mesh.
 
     Returns:
         [s/s]; None where it does not reach it.
     """
     if line and line[0].displacement_error <= error:
         return line[0].cpu_per_second
-    for i, (a, b) in enumerate(pairwise(line)):
-        last = beyond and i == len(line) - 2
-        falls = b.displacement_error < a.displacement_error
-        if falls and (b.displacement_error <= error or last):
+    for a, b in pairwise(line):
+        if b.displacement_error <= error < a.displacement_error:
             share = np.log(a.displacement_error / error) / np.log(
                 a.displacement_error / b.displacement_error
             )

@@ -111,9 +111,8 @@ def test_the_cost_of_an_error_is_read_off_the_line_of_a_method() -> None:
     assert cost_for(line, 0.2) == pytest.approx(0.4)
     assert cost_for(line, 0.5) == pytest.approx(0.1)
     assert cost_for(line, 0.05) is None
-    assert cost_for(line, 0.05, beyond=True) == pytest.approx(6.4)
     text = sentence(POINTS)
-    assert '10 % costs 0.05 s a second, with linear_smoothed by symplectic_euler' in text
+    assert '10 % costs at most 0.05 s a second, with linear_smoothed by symplectic_euler' in text
     assert '1 % was not reached' in text
 
 
