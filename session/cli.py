@@ -214,6 +214,43 @@ def compare_cuts(
     write_cases(output)
 
 
+@app.command(epilog=EXIT_STATUSES)
+def chart(
+    output: Annotated[
+        Path,
+        typer.Option('--output', '-o', help='Folder for the page; charts/ in it for the rest.'),
+    ] = Path('docs'),
+) -> None:
+    """Measure every method on this machine: error against CPU time, pictures and CSV."""
+    from session.chart import run_chart
+
+    run_chart(output)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def plan(
+    scene: Annotated[
+        str, typer.Argument(help='Name of a scene in config/scenes, or path of a scene file.')
+    ],
+) -> None:
+    """Find the least method that meets a scene's budget, and say why not a lesser one."""
+    from session.plan_report import run_plan
+
+    raise typer.Exit(int(run_plan(scene)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def stability(
+    scene: Annotated[
+        str, typer.Argument(help='Name of a scene in config/scenes, or path of a scene file.')
+    ],
+) -> None:
+    """Print each integrator's largest stable step on a scene's mesh: by theory, and measured."""
+    from session.stability_report import run_stability
+
+    run_stability(scene)
+
+
 @app.command('haptics-accuracy', epilog=EXIT_STATUSES)
 def haptics_accuracy(
     output: Annotated[

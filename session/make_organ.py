@@ -148,11 +148,13 @@ def _write(path: Path, nodes: Points, tetrahedra: NDArray[np.int32]) -> None:
 
 
 def main() -> None:
-    """Writes both meshes into a folder."""
+    """Writes the meshes into a folder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('folder', type=Path, help='where the .msh files go, as config/meshes')
     folder = parser.parse_args().folder
     _write(folder / 'block_yi2007.msh', *block((4, 4, 1), 0.01))
+    _write(folder / 'slab.msh', *block((12, 12, 5), 0.008))
+    _write(folder / 'flap.msh', *block((12, 5, 3), 0.01 / 3))
     _write(folder / 'liver.msh', *organ())
 
 

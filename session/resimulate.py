@@ -17,6 +17,7 @@ from bags.resimulation import Recomputation
 from cutting.methods import make_method
 from cutting.warm_up import warm_up as warm_up_cutting
 from haptic_bridge import chain
+from session.errors import SessionError
 from session.experiment import run_experiment
 from session.recorded_scene import restore_scene
 from session.scene import Scene, load_scene
@@ -46,8 +47,18 @@ def resimulate(folder: Path, changes: Mapping[str, str]) -> Status:
 
 
 def recomputation(scene: Scene) -> Recomputation:
-    """Simulation and cutting of a scene, before the first frame."""
-    return Recomputation(make_simulation(scene.tissue), make_method(scene.cutting))
+    """Simulation and cutting of a scene, before the first frame.
+
+    Raises:
+        SessionError: the scene leaves the method to a plan, which depends on the machine's speed.
+    """
+    if scene.tissue.method == 'auto':
+        raise SessionError(
+            'the scene has tissue.method auto: what was planned depends on the speed of the machine '
+            'that recorded; only sessions of a given model and integrator can be computed again'
+        )
+    simulation, _ = make_simulation(scene.tissue)
+    return Recomputation(simulation, make_method(scene.cutting))
 
 
 def pose_check(scene: Scene) -> Callable[[Any, Any], float]:

@@ -97,7 +97,7 @@ def _value(field: FieldInfo) -> str:
         item = get_args(kind)[0]
         limits = _limits(item.__metadata__[0].metadata) if hasattr(item, '__metadata__') else ''
         return f'{len(get_args(kind))} numbers' + (f', each {limits}' if limits else '')
-    names = {float: 'number', int: 'whole number', str: 'word'}
+    names = {float: 'number', int: 'whole number', str: 'word', bool: '`true`, `false`'}
     return _limits(field.metadata) or names.get(kind, 'path')
 
 

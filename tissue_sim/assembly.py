@@ -1,4 +1,4 @@
-"""From the scene's section `tissue` to the simulation of it."""
+"""From what a scene says of its tissue to the tissue."""
 
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
@@ -6,12 +6,40 @@ from tissue_sim.dynamics import TimeStepping
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.mesh_io import load_tissue
+from tissue_sim.plan import Plan, Task, plan
 from tissue_sim.settings import TissueSettings
 from tissue_sim.simulation import TissueSimulation
+from tissue_sim.warm_up import warm_up
 
 
-def make_simulation(settings: TissueSettings) -> TissueSimulation:
-    """The simulation that a scene describes.
+def make_task(settings: TissueSettings) -> Task:
+    """The scene as the planner sees it.
+
+    Raises:
+        MeshError: the mesh cannot be used.
+    """
+    nodes, tetrahedra, fixed = load_tissue(settings)
+    m, d, i = settings.material, settings.damping, settings.integration
+    return Task(
+        TetMesh(nodes, tetrahedra, fixed),
+        Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
+        Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
+        settings.budget,
+        TimeStepping(
+            settings.integrator,
+            rate=i.rate,
+            safety=i.safety,
+            min_substeps=i.min_substeps,
+            max_substeps=i.max_substeps,
+            frequency_growth=i.frequency_growth,
+        ),
+    )
+
+
+def make_simulation(settings: TissueSettings) -> tuple[TissueSimulation, Plan | None]:
+    """The simulation that a scene describes, and the plan it goes by if it asks for one.
+
+    Where no method fits the budget, the scene's own model and integrator are taken.
 
     Args:
         settings: its section `tissue`.
@@ -19,21 +47,21 @@ def make_simulation(settings: TissueSettings) -> TissueSimulation:
     Raises:
         MeshError: the mesh cannot be used.
     """
-    nodes, tetrahedra, fixed = load_tissue(settings)
-    m, d = settings.material, settings.damping
-    return TissueSimulation(
-        TetMesh(nodes, tetrahedra, fixed),
-        Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
-        Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
-        model=settings.model,
-        stepping=TimeStepping(
-            settings.integrator,
-            rate=settings.integration.rate,
-            safety=settings.integration.safety,
-            min_substeps=settings.integration.min_substeps,
-            max_substeps=settings.integration.max_substeps,
-            frequency_growth=settings.integration.frequency_growth,
-        ),
+    task = make_task(settings)
+    found = None
+    if settings.method == 'auto':
+        warm_up()  # a kernel that is compiled meanwhile would count as cost
+        found = plan(task)
+    model, stepping = settings.model, task.stepping
+    if found is not None and found.chosen is not None:
+        model, stepping = found.chosen.model, found.stepping
+    simulation = TissueSimulation(
+        task.mesh,
+        task.material,
+        task.resistance,
+        model=model,
+        stepping=stepping,
         active=ActiveSettings(**settings.active_region.model_dump()),
         stretch=settings.stretch,
     )
+    return simulation, found

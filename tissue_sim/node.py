@@ -36,7 +36,9 @@ class TissueSimNode(Node):
         self.declare_parameter('seed', 0)
         settings = read_section(scene, 'tissue', TissueSettings)
         self._scene = scene.stem
-        self._simulation = make_simulation(settings)
+        self._simulation, self._plan = make_simulation(settings)
+        self._over = ''
+        self._log_plan()
         self._loop = PeriodicLoop(settings.integration.rate)
         self._encoder = messages.DeltaEncoder(self._simulation.mesh, self._simulation.displacement)
         self._lock = threading.Lock()
@@ -51,6 +53,30 @@ class TissueSimNode(Node):
         self._next_keyframe = 0.0
         self._frame: Frame | None = None
         self._connect()
+
+    def _log_plan(self) -> None:
+        if self._plan is None:
+            return
+        log = self.get_logger()
+        for sentence in self._plan.rejected:
+            log.info(f'not {sentence}')
+        if self._plan.chosen is None:
+            log.warning(
+                f'no method fits the budget, so {self._simulation.model.name} is taken; to have '
+                f'one: {"; ".join(self._plan.remedies)}'
+            )
+        else:
+            log.info(f'method: {self._plan.chosen.name}')
+
+    def _check_plan(self, frame: Frame) -> None:
+        """Says once after a cut when the plan does not hold for the tissue any more."""
+        if self._plan is None or self._touched is None:
+            return
+        needed = frame.substeps / max(frame.slow_motion, 1e-9)
+        over = self._plan.over(needed, len(self._simulation.mesh.tetrahedra))
+        if over and not self._over:
+            self.get_logger().warning(over)
+        self._over = over
 
     def _connect(self) -> None:
         self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, ros.LATCHED)
@@ -79,6 +105,7 @@ class TissueSimNode(Node):
         self._take_answer()
         contact = self._newest_contact()
         frame = self._simulation.frame(contact)
+        self._check_plan(frame)
         now = time.time_ns()
         used = None if contact is None else self._contact
         self._inputs.publish(
@@ -220,6 +247,8 @@ class TissueSimNode(Node):
             return DiagnosticStatus.ERROR, f'a frame was taken back: {frame.trouble}', values
         if frame.trouble:
             return DiagnosticStatus.WARN, frame.trouble, values
+        if self._over:
+            return DiagnosticStatus.WARN, self._over, values
         if frame.slow_motion < 0.999:
             return DiagnosticStatus.WARN, 'max_substeps is too small for real time', values
         return DiagnosticStatus.OK, frame.state.name.lower(), values

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from tissue_sim.budget import Budget
 from tissue_sim.elasticity import ModelName
 from tissue_sim.integrators import IntegratorName
 from tissue_sim.scene_file import SceneModel, ScenePath
@@ -211,6 +212,11 @@ class TissueSettings(SceneModel):
         le=100,
         description='contact force that lets the blade in [N], above 0 to 100',
     )
+    method: Literal['given', 'auto'] = Field(
+        default='given',
+        description='given: model and integrator of the scene; auto: the least that meet its '
+        'budget, those of the scene where none does',
+    )
     model: ModelName = Field(
         default='linear',
         description='linear: tensor-mass; linear_smoothed: strains averaged over nodes, against '
@@ -226,6 +232,10 @@ class TissueSettings(SceneModel):
     )
     integration: Integration = Field(
         default=Integration(), description='rate, safety, substeps and frequency_growth'
+    )
+
+    budget: Budget = Field(
+        default=Budget(), description='what the method must be able to do, and what it may cost'
     )
 
     @model_validator(mode='after')

@@ -1,0 +1,166 @@
+"""The chart: references against formulas, fronts, what it writes; limits of stability."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.reproduction import block_100, block_258, efficiency, orders
+from session.chart import THESIS, cost_for, sentence, write_chart
+from session.chart_measure import Point, cpu_per_second, with_front
+from session.chart_meshes import end_load, kuhn_block
+from session.chart_problems import AfterCut, Cantilever, static_problems
+from session.chart_reference import HexGrid, Solid, exact_beam, extrapolated, graded
+from session.chart_vibration import Vibration
+from session.scene import load_scene
+from session.stability_report import highest_mode, measured_limit
+from tissue_sim.assembly import make_task
+from tissue_sim.dynamics import TimeStepping
+from tissue_sim.elasticity import ElasticModel
+
+BEAM = Solid((0.10, 0.02, 0.02), 5000.0, 0.3)
+
+
+def test_the_exact_beam_is_timoshenkos_under_a_small_load_and_the_elastica_when_slender() -> None:
+    length, width, height = BEAM.size
+    load, modulus = 1e-6, BEAM.youngs_modulus
+    inertia, area = width * height**3 / 12, width * height
+    shear = 10 * 1.3 / (12 + 11 * 0.3) * modulus / 2.6 * area
+    small = load * length**3 / (3 * modulus * inertia) + load * length / shear
+    assert exact_beam(BEAM, load).down == pytest.approx(small, rel=1e-5)
+    slender = Solid((0.10, 1e-4, 1e-4), 5000.0, 0.0)
+    # Bisshopp and Drucker 1945, P L^2 / E I = 2.
+    found = exact_beam(slender, 2 * 5000.0 * 1e-16 / 12 / 0.01)
+    assert found.down == pytest.approx(0.04935, rel=1e-3)
+    assert found.slope == pytest.approx(0.7817, rel=1e-3)
+
+
+def test_the_reference_solver_stretches_a_bar_exactly() -> None:
+    solid = Solid((0.03, 0.01, 0.01), 5000.0, 0.3)
+    grid = HexGrid(solid, (graded(0.03, 2), graded(0.01, 1), graded(0.01, 2, (0.0,))))
+    x = grid.places
+    held = [grid.components(x[:, axis] < 1e-9, axis) for axis in range(3)]
+    pulled = grid.components(x[:, 0] > 0.03 - 1e-9, 0)
+    dofs = np.unique(np.concatenate([*held, pulled]))
+    u = grid.solve(np.zeros(len(x)), dofs, np.where(np.isin(dofs, pulled), 3e-4, 0.0))
+    assert (grid.stiffness @ u)[pulled].sum() == pytest.approx(5000.0 * 1e-4 * 0.01, rel=1e-9)
+
+
+def test_the_reference_beam_vibrates_as_euler_and_bernoulli_say_for_slender_ones() -> None:
+    omega, _ = Vibration().reference
+    slender = 1.875104**2 * np.sqrt(5000.0 * 0.02**2 / 12 / 1050.0) / 0.1**2
+    assert 0.95 * slender < omega < slender  # shear and the section's inertia slow it
+
+
+def test_extrapolation_finds_the_limit_of_a_geometric_sequence() -> None:
+    found = extrapolated(*(3.0 - 0.4 * 0.3**k for k in range(3)))
+    assert found.value == pytest.approx(3.0, rel=1e-12)
+
+
+def test_loads_and_meshes_of_the_chart_are_what_they_say() -> None:
+    mesh = kuhn_block((5, 2, 2), BEAM.size)
+    assert mesh.volumes().min() > 0
+    assert mesh.volumes().sum() == pytest.approx(np.prod(BEAM.size))
+    np.testing.assert_allclose(end_load(mesh, BEAM, 0.5).sum(axis=0), [0, 0, -0.5], atol=1e-12)
+
+
+def test_smoothed_strains_cure_the_locking_that_plain_elements_show() -> None:
+    problem = Cantilever(0.47)
+    # The reference of the full chart; computed there, and here from two coarser grids only.
+    vars(problem)['reference'] = extrapolated(*(problem._half(k) for k in (2, 3, 4)))
+    plain, smoothed = (problem.rest(m, 2).errors for m in ('linear', 'linear_smoothed'))
+    assert 0.70 < plain.displacement < 0.80
+    assert smoothed.displacement < 0.15
+
+
+def test_the_notched_block_of_the_chart_is_cut_half_through_and_moves() -> None:
+    problem = AfterCut()
+    mesh = problem.whole(6)
+    assert problem.cut(mesh)
+    lips = mesh.rest[mesh.triangles[mesh.triangle_kind == 1]]
+    sides = np.cross(lips[:, 1] - lips[:, 0], lips[:, 2] - lips[:, 0])
+    area = np.linalg.norm(sides, axis=1).sum() / 4
+    assert area == pytest.approx(0.02 * 0.02, rel=0.3)
+    dynamics = problem.dynamics('linear', 6, TimeStepping('symplectic_euler'))
+    dynamics.velocity[dynamics.mesh.fixed == 0] = 1e-4
+    cost, step, substeps = cpu_per_second(dynamics)
+    assert cost > 0 and step * substeps == pytest.approx(1 / 30)
+
+
+def point(model: str, integrator: str, resolution: int, cost: float, error: float) -> Point:
+    return Point('cantilever_0.47', model, integrator, resolution, 6 * resolution**3, 1.0, 30, cost,
+                 error, error)  # fmt: skip
+
+
+POINTS = [
+    point('linear', 'rk4', 2, 0.1, 0.4),
+    point('linear', 'rk4', 4, 1.6, 0.1),
+    point('linear_smoothed', 'symplectic_euler', 2, 0.05, 0.1),
+    point('linear_smoothed', 'symplectic_euler', 4, 0.8, 0.0251),
+]
+
+
+def test_only_what_nothing_beats_in_both_is_on_the_front() -> None:
+    front = [p.front for p in with_front(POINTS)]
+    assert front == [False, False, True, True]
+
+
+def test_the_cost_of_an_error_is_read_off_the_line_of_a_method() -> None:
+    line = POINTS[:2]
+    assert cost_for(line, 0.2) == pytest.approx(0.4)
+    assert cost_for(line, 0.5) == pytest.approx(0.1)
+    assert cost_for(line, 0.05) is None
+    text = sentence(POINTS)
+    assert '10 % costs at most 0.05 s a second, with linear_smoothed by symplectic_euler' in text
+    assert '1 % was not reached' in text
+
+
+def test_page_table_and_a_picture_by_panel_are_written(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    names = [problem.name for problem in (*static_problems(), Vibration())]
+    points = with_front([replace(p, problem=name) for name in names for p in POINTS])
+    write_chart(tmp_path, points, (6.0, 6.1))
+    page = (tmp_path / 'charts.md').read_text()
+    for name in names:
+        assert f'(charts/{name}.png)' in page
+        assert (tmp_path / 'charts' / f'{name}.png').stat().st_size > 10_000
+    with (tmp_path / 'charts' / 'points.csv').open() as table:
+        rows = list(csv.DictReader(table))
+    assert len(rows) == len(points)
+    assert {(row['model'], row['integrator']) for row in rows} >= {THESIS}
+
+
+@pytest.mark.parametrize('model', ['linear', 'corotational_smoothed'])
+@pytest.mark.parametrize('integrator', ['euler', 'symplectic_euler', 'rk4', 'implicit'])
+def test_the_measured_limit_of_stability_is_that_of_theory(model: str, integrator: str) -> None:
+    task = make_task(load_scene('block').tissue)
+    elastic = ElasticModel(task.mesh, task.material, model)
+    limit = measured_limit(task, elastic, integrator, *highest_mode(elastic))
+    if integrator == 'implicit':
+        assert limit.measured == limit.theory == np.inf
+    else:
+        assert limit.measured == pytest.approx(limit.theory, rel=0.01)
+        assert limit.used <= 1.001 * limit.theory
+
+
+def test_the_blocks_of_the_thesis_have_its_numbers_of_nodes_and_tetrahedra() -> None:
+    for mesh, nodes, tetrahedra in ((block_100(), 50, 100), (block_258(), 85, 258)):
+        assert (mesh.node_count, len(mesh.tetrahedra)) == (nodes, tetrahedra)
+        size = mesh.rest.max(axis=0) - mesh.rest.min(axis=0)
+        assert mesh.volumes().sum() == pytest.approx(np.prod(size), rel=1e-9)
+
+
+def test_table_4_1_of_the_thesis_holds() -> None:
+    euler, rk4 = orders('euler'), orders('rk4')
+    assert (euler.single, euler.total) == pytest.approx((2, 1), abs=0.05)
+    assert (rk4.single, rk4.total) == pytest.approx((5, 4), abs=0.05)
+
+
+def test_table_4_2_of_the_thesis_does_not_follow_from_its_constants() -> None:
+    euler, rk4 = efficiency('euler'), efficiency('rk4')
+    assert euler.theory == pytest.approx(2e-5, rel=1e-3)  # printed: 0.0016
+    assert 0.004 < rk4.theory < 0.005  # printed: 0.032
+    assert euler.measured == pytest.approx(euler.theory, rel=0.01)
+    assert rk4.measured == pytest.approx(rk4.theory, rel=0.01)
