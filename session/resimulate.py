@@ -54,8 +54,8 @@ def recomputation(scene: Scene) -> Recomputation:
     """
     if scene.tissue.method == 'auto':
         raise SessionError(
-            'the scene has tissue.method auto: what was planned depends on the speed of the machine '
-            'that recorded; only sessions of a given model and integrator can be computed again'
+            'the scene has tissue.method auto: what was planned depends on the speed of the '
+            'machine; only sessions of a given model and integrator can be computed again'
         )
     simulation, _ = make_simulation(scene.tissue)
     return Recomputation(simulation, make_method(scene.cutting))
