@@ -19,7 +19,7 @@ from tissue_sim.elasticity import ElasticModel
 from tissue_sim.equilibrium import equilibrium
 from tissue_sim.errors import MeshError
 from tissue_sim.mesh import TetMesh
-from tissue_sim.plan import Plan, plan
+from tissue_sim.plan import Plan, frame_time, plan
 from tissue_sim.probe import Press, places, settlement
 from tissue_sim.refine import refined
 from tissue_sim.simulation import TissueSimulation
@@ -144,12 +144,13 @@ def measured_frame(found: Plan) -> float:
     times = []
     for press in places(task.mesh, task.budget.contact_radius, 4)[1:]:
         for number in range(_FRAMES // 2):
-            depth = 0.5 * task.budget.displacement * np.sin(np.pi * number * 2 / _FRAMES) ** 2
+            most = min(0.5 * task.budget.displacement, 0.9 * task.resistance.threshold / 200.0)
+            depth = most * np.sin(np.pi * number * 2 / _FRAMES) ** 2
             contact = _contact(task.mesh, press, depth)
             start = time.thread_time()
             simulation.frame(contact)
             times.append(time.thread_time() - start)
-    return float(np.median(times))
+    return frame_time(found.chosen.integrator, times)
 
 
 def _contact(mesh: TetMesh, press: Press, depth: float) -> ToolContact:

@@ -138,7 +138,7 @@ def _cost_of(points: list[Point], target: float) -> str:
 def _plain(points: list[Point]) -> str:
     """What plain elements need for an error that smoothed ones have as well."""
     found = []
-    for kind in ('linear', 'corotational'):
+    for kind in sorted({p.model for p in points} & {'linear', 'corotational'}):
         plain = _cheapest(points, kind)[-1]
         as_near = [
             p
