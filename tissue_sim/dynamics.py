@@ -101,6 +101,7 @@ class Dynamics:
         self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
         self._bounds: dict[float, float] = {}
         self._still = 0
+        self._cut = False
         self._caution = 1
         self._cautious = 0
         self._guard = Guard(mesh, material.youngs_modulus)
@@ -198,6 +199,8 @@ class Dynamics:
         Args:
             coupling: the tool's spring.
         """
+        if self._cut:
+            self.restart()  # a pass over the whole tissue, which a batch must not pay for
         self._frequency.refine()
         if self._cautious:
             self._cautious -= 1
@@ -320,6 +323,7 @@ class Dynamics:
         kinetic = 0.5 * float(self._inertia[: len(v)] @ np.square(v).sum(axis=1))
         self._guard.open(elastic + kinetic)
         self._still = 0
+        self._cut = False
 
     def _follow_cut(self, nodes: np.ndarray) -> None:
         """Brings what is kept by node up to date where a cut touched it, nodes of shape (r,)."""
@@ -333,4 +337,4 @@ class Dynamics:
         inverse = np.where(free, 1.0 / self._inertia[nodes], 0.0)
         self.inverse_mass.reshape(-1, 3)[nodes] = inverse[:, None]
         self._active.follow_cut(nodes)
-        self.restart()
+        self._cut = True
