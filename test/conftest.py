@@ -5,7 +5,6 @@ Such a test is run again, at most twice, if it failed while a processor demonstr
 (stand_still.py). A fault of the code fails each time.
 """
 
-import functools
 import os
 import shutil
 import subprocess
@@ -24,6 +23,7 @@ ATTEMPTS = 3
 OUTPUT = pytest.StashKey[Path]()
 WATCH = pytest.StashKey['subprocess.Popen[bytes]']()
 REPEATED = pytest.StashKey[list[str]]()
+BUILT = pytest.StashKey[Path]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -81,13 +81,17 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 @pytest.fixture
-def others_messages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def others_messages(
+    pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, str]:
     """Environment in which crtk_msgs and omni_msgs are there, built here once if they are not."""
     if find_spec('crtk_msgs') and find_spec('omni_msgs'):
         return dict(os.environ)
     if shutil.which('colcon') is None:
         pytest.skip('colcon is not installed: with a sourced Jazzy, apt install ros-dev-tools')
-    prefix = built_stand_ins(tmp_path_factory)
+    if BUILT not in pytestconfig.stash:
+        pytestconfig.stash[BUILT] = built_stand_ins(tmp_path_factory.mktemp('stand_ins'))
+    prefix = pytestconfig.stash[BUILT]
     added = {
         'PYTHONPATH': prefix / 'lib' / PYTHON / 'site-packages',
         'LD_LIBRARY_PATH': prefix / 'lib',
@@ -98,10 +102,8 @@ def others_messages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     }
 
 
-@functools.cache
-def built_stand_ins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built_stand_ins(workspace: Path) -> Path:
     """Builds the packages of test/stand_ins in a temporary workspace; returns its prefix."""
-    workspace = tmp_path_factory.mktemp('stand_ins')
     clean = {key: value for key, value in os.environ.items() if not key.startswith('PYTHON')}
     prefixes = clean.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     kept = [p for p in prefixes if not Path(p, 'share', 'cutting_trainer_msgs').exists()]

@@ -25,6 +25,7 @@ PUBLISHED_AS = {
     'mpl_toolkits': 'matplotlib',
     'pydantic_core': 'pydantic',
     'ruamel': 'ruamel.yaml',
+    'skfem': 'scikit-fem',
     'yaml': 'pyyaml',
 }
 NOT_FROM_PYPI = {
@@ -42,6 +43,7 @@ NOT_FROM_PYPI = {
     'rosidl_pycommon',
     'rosidl_runtime_py',
     'sensor_msgs',
+    'service_msgs',
     'std_msgs',
     'std_srvs',
 }
