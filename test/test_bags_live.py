@@ -32,6 +32,8 @@ from bags.reader import open_bag
 from bags.repair import repair_bag
 from tissue_sim.ros import CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).parents[1]
 DOMAIN = 20 + os.getpid() % 80
 PATIENCE = 20.0

@@ -26,6 +26,8 @@ from tissue_sim import ros
 from tissue_sim.mesh import TetMesh
 from tissue_sim.messages import DeltaEncoder, delta_from, mesh_message
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).parents[1]
 SCENE = 'cutting: {method: combined}\n'
 

@@ -31,6 +31,8 @@ from tissue_sim.mesh import TetMesh
 from tissue_sim.replica import MeshReplica
 from tissue_sim.ros import FORCE, take
 
+pytestmark = pytest.mark.real_time
+
 SECONDS = 48.0
 """Longer than it takes, even on a busy machine: the test interrupts the session."""
 UNDER_WAY = 0.5

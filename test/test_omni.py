@@ -10,6 +10,8 @@ import pytest
 from haptic_bridge.omni import ForceLatch, OmniConvention
 from session.graph import node_environment
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = 90
 MILLISECOND = 1_000_000

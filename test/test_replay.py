@@ -23,6 +23,8 @@ from session.replay import _Over, act_on, replay_nodes
 from tissue_sim import ros
 from tissue_sim.replica import MeshReplica
 
+pytestmark = pytest.mark.real_time
+
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 SUBSCRIBERS = {

@@ -14,6 +14,8 @@ import pytest
 from session.node_process import NodeCommand
 from session.processes import Event, Supervisor
 
+pytestmark = pytest.mark.real_time
+
 FAKE = Path(__file__).with_name('fake_node.py')
 ROOT = FAKE.parents[1]
 ENVIRONMENT = os.environ | {'PYTHONUNBUFFERED': '1'}
