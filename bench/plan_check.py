@@ -14,7 +14,7 @@ from rich.table import Table
 
 from session.scene import SCENES, load_scene
 from tissue_sim.assembly import make_task
-from tissue_sim.contact import State, ToolContact
+from tissue_sim.contact import press_triangle
 from tissue_sim.elasticity import ElasticModel
 from tissue_sim.equilibrium import equilibrium
 from tissue_sim.errors import MeshError
@@ -146,31 +146,11 @@ def measured_frame(found: Plan) -> float:
         for number in range(_FRAMES // 2):
             most = min(0.5 * task.budget.displacement, 0.9 * task.resistance.threshold / 200.0)
             depth = most * np.sin(np.pi * number * 2 / _FRAMES) ** 2
-            contact = _contact(task.mesh, press, depth)
+            contact = press_triangle(task.mesh, press.centre, press.direction, depth)
             start = time.thread_time()
             simulation.frame(contact)
             times.append(time.thread_time() - start)
     return frame_time(found.chosen.integrator, times)
-
-
-def _contact(mesh: TetMesh, press: Press, depth: float) -> ToolContact:
-    corners = mesh.rest[mesh.triangles]
-    nearest = int(np.linalg.norm(corners.mean(axis=1) - press.centre, axis=1).argmin())
-    nodes = mesh.triangles[nearest].astype(np.int64)
-    device = mesh.rest[nodes].mean(axis=0) + depth * press.direction
-    return ToolContact(
-        state=State.TOUCHING,
-        topology=mesh.topology,
-        nodes=nodes,
-        weights=np.full(3, 1 / 3),
-        device=device,
-        offset=np.zeros(3),
-        normal=-press.direction,
-        stiffness=200.0,
-        radius=0.004,
-        blade_root=device - 0.02 * press.direction,
-        blade_tip=device,
-    )
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from cutting.settings import CuttingSettings
 from session.stability_report import highest_mode, measured_limit
 from tissue_sim.blade import Resistance, Sweep
 from tissue_sim.budget import Budget
-from tissue_sim.contact import State, ToolContact
+from tissue_sim.contact import press_triangle
 from tissue_sim.coupling import Coupling
 from tissue_sim.dynamics import TimeStepping
 from tissue_sim.elasticity import ElasticModel
@@ -34,6 +34,7 @@ Floats = NDArray[np.float64]
 
 THESIS = Material(642.55, 0.47, 1050.0, 1e-5, 2e-5)
 """Section 7.2.2: alpha 1e-5 1/s, beta 2e-5 s, which it prints in "m * sec"."""
+DOWN = np.array([0.0, 0.0, -1.0])
 METHODS: tuple[IntegratorName, ...] = ('euler', 'rk4')
 _JITTER = 0.12
 
@@ -188,27 +189,6 @@ def efficiency(integrator: IntegratorName, material: Material = THESIS) -> Effic
     return Efficiency(limit.theory, limit.measured, float(np.median(times[1:])))
 
 
-def contact_on(mesh: TetMesh, place: Floats, depth: float) -> ToolContact:
-    """A tool that presses on the triangle at a place of the upper side, so deep [m]."""
-    corners = mesh.rest[mesh.triangles]
-    away = np.linalg.norm(corners.mean(axis=1) - place, axis=1)
-    nodes = mesh.triangles[int(away.argmin())].astype(np.int64)
-    device = mesh.rest[nodes].mean(axis=0) - [0.0, 0.0, depth]
-    return ToolContact(
-        state=State.TOUCHING,
-        topology=mesh.topology,
-        nodes=nodes,
-        weights=np.full(3, 1 / 3),
-        device=device,
-        offset=np.zeros(3),
-        normal=np.array([0.0, 0.0, 1.0]),
-        stiffness=200.0,
-        radius=0.004,
-        blade_root=device + np.array([0, 0, 0.02]),
-        blade_tip=device,
-    )
-
-
 def palpation() -> Palpation:
     """Presses 1 to 4 mm deep in the middle of the block, two seconds each, by RK4."""
     mesh = block_100()
@@ -219,7 +199,7 @@ def palpation() -> Palpation:
     depths, forces, times = np.arange(1, 5) * 1e-3, [], []
     for depth in depths:
         for _ in range(60):
-            contact = contact_on(mesh, middle, float(depth))
+            contact = press_triangle(mesh, middle, DOWN, float(depth))
             start = time.thread_time()
             frame = simulation.frame(contact)
             times.append(time.thread_time() - start)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tissue_sim.blade import Sweep
+from tissue_sim.mesh import TetMesh
 
 
 class State(enum.IntEnum):
@@ -45,6 +46,37 @@ class ToolContact:
     blade_root: np.ndarray
     blade_tip: np.ndarray
     sequence: int = 0
+
+
+def press_triangle(
+    mesh: TetMesh, place: np.ndarray, direction: np.ndarray, depth: float, stiffness: float = 200.0
+) -> ToolContact:
+    """A tool that presses straight on one triangle of the tissue at rest: to measure frames by.
+
+    Args:
+        mesh: the tissue.
+        place: the triangle is the one whose middle is nearest [m], shape (3,).
+        direction: of the press, a unit vector, shape (3,).
+        depth: of the tip below the triangle [m].
+        stiffness: of the coupling spring [N/m].
+    """
+    middles = mesh.rest[mesh.triangles].mean(axis=1)
+    nearest = int(np.linalg.norm(middles - place, axis=1).argmin())
+    nodes = mesh.triangles[nearest].astype(np.int64)
+    device = mesh.rest[nodes].mean(axis=0) + depth * direction
+    return ToolContact(
+        state=State.TOUCHING,
+        topology=mesh.topology,
+        nodes=nodes,
+        weights=np.full(3, 1 / 3),
+        device=device,
+        offset=np.zeros(3),
+        normal=-direction,
+        stiffness=stiffness,
+        radius=0.004,
+        blade_root=device - 0.02 * direction,
+        blade_tip=device,
+    )
 
 
 @dataclass(frozen=True)

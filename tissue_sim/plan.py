@@ -13,7 +13,7 @@ import numpy as np
 
 from tissue_sim.blade import Resistance
 from tissue_sim.budget import Budget
-from tissue_sim.contact import State, ToolContact
+from tissue_sim.contact import ToolContact, press_triangle
 from tissue_sim.dynamics import TimeStepping
 from tissue_sim.elasticity import MODELS, ModelName
 from tissue_sim.integrators import INTEGRATORS, IntegratorName
@@ -328,26 +328,9 @@ def _frame_times(
 
 
 def _contact(task: Task, press: Press, share: float) -> ToolContact:
-    mesh = task.mesh
-    corners = mesh.rest[mesh.triangles]
-    nearest = int(np.linalg.norm(corners.mean(axis=1) - press.centre, axis=1).argmin())
-    nodes = mesh.triangles[nearest].astype(np.int64)
     # Less than what lets the blade in: contact stays contact.
     depth = min(0.9 * task.resistance.threshold / _COUPLING, 0.5 * task.budget.displacement)
-    device = mesh.rest[nodes].mean(axis=0) + share * depth * press.direction
-    return ToolContact(
-        state=State.TOUCHING,
-        topology=mesh.topology,
-        nodes=nodes,
-        weights=np.full(3, 1 / 3),
-        device=device,
-        offset=np.zeros(3),
-        normal=-press.direction,
-        stiffness=_COUPLING,
-        radius=0.004,
-        blade_root=device - 0.02 * press.direction,
-        blade_tip=device,
-    )
+    return press_triangle(task.mesh, press.centre, press.direction, share * depth, _COUPLING)
 
 
 def _fits(task: Task, candidate: Candidate) -> bool:
