@@ -218,12 +218,12 @@ class TissueSettings(SceneModel):
         'budget, those of the scene where none does',
     )
     model: ModelName = Field(
-        default='linear',
+        default='linear_smoothed',
         description='linear: tensor-mass; linear_smoothed: strains averaged over nodes, against '
         'locking; corotational: elements turn with the tissue; corotational_smoothed: both',
     )
     integrator: IntegratorName = Field(
-        default='rk4',
+        default='symplectic_euler',
         description='euler: forward, needs damping; symplectic_euler: one force a step; rk4: '
         'fourth-order Runge-Kutta; implicit: backward Euler, any step, damps',
     )
