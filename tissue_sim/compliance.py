@@ -4,11 +4,18 @@ import numpy as np
 from numba import njit
 
 from tissue_sim.elasticity import ElasticModel, stiffness_product
+from tissue_sim.errors import MeshError
+
+_AT_MOST = 100_000
+"""Conjugate-gradient steps of a static solution: far more than a tissue needs that is held."""
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
-def _conjugate_gradients(operands, preconditioner, b, x, work, steps):
-    """Preconditioned conjugate gradients on K x = b from x; the residual is left in work[0]."""
+def _conjugate_gradients(operands, preconditioner, b, x, work, steps, least):
+    """Preconditioned conjugate gradients on K x = b from x; the residual is left in work[0].
+
+    They end after some steps, or where the residual, weighed by the preconditioner, is `least`.
+    """
     r, p, q = work[0], work[1], work[2]
     stiffness_product(operands, x, q)
     rho = 0.0
@@ -18,7 +25,7 @@ def _conjugate_gradients(operands, preconditioner, b, x, work, steps):
         p[i] = preconditioner[i] * r[i]
         rho += r[i] * p[i]
     for _ in range(steps):
-        if rho <= 1e-30:
+        if rho <= least:
             break
         stiffness_product(operands, p, q)
         curvature = 0.0
@@ -51,17 +58,28 @@ def solve_static(
 
     Returns:
         [m], shape (n, 3).
+
+    Raises:
+        MeshError: conjugate gradients did not come to it: a part of the tissue hangs on nothing.
     """
     b = np.where(free, load.ravel(), 0.0)
     x = np.zeros_like(b)
     preconditioner = _diagonal_preconditioner(model, free)
     work = np.empty((3, len(b)))
-    for _ in range(100):
-        _conjugate_gradients(model.operands(), preconditioner, b, x, work, 200)
+    least = float(preconditioner @ np.square(b)) * tolerance**2
+    left = 1.0
+    # More than once: the residual that the recursion carries parts from the true one.
+    for _ in range(4):
+        _conjugate_gradients(model.operands(), preconditioner, b, x, work, _AT_MOST, least)
         residual = np.where(free, b - model.product(x.reshape(-1, 3)).ravel(), 0.0)
-        if np.linalg.norm(residual) <= tolerance * np.linalg.norm(b):
-            break
-    return x.reshape(-1, 3)
+        left = float(np.linalg.norm(residual)) / max(float(np.linalg.norm(b)), 1e-300)
+        if left <= tolerance:
+            return x.reshape(-1, 3)
+        least *= 0.01
+    raise MeshError(
+        f'no equilibrium: {left:.1e} of the load is left, {tolerance:.1e} is asked for; is every '
+        'part of the tissue held by fixed nodes?'
+    )
 
 
 def _diagonal_preconditioner(model: ElasticModel, free: np.ndarray) -> np.ndarray:
@@ -114,7 +132,7 @@ class PointCompliance:
         for axis, b, x, r in zip(axes, loads, self._x, residuals, strict=True):
             b.reshape(-1, 3)[nodes] = weights[:, None] * axis
             b[~free] = 0.0
-            _conjugate_gradients(model.operands(), preconditioner, b, x, work, self._steps)
+            _conjugate_gradients(model.operands(), preconditioner, b, x, work, self._steps, 1e-30)
             r[:] = work[0]
         value = loads @ self._x.T + self._x @ residuals.T
         sizes, vectors = np.linalg.eigh((value + value.T) / 2)
