@@ -272,18 +272,17 @@ class Dynamics:
 
     def _cause(self, coupling: Coupling, dt: float) -> str:
         name, bound = self.stepping.integrator, self.bound(coupling)
+        limit = f'the {1e3 * bound:.3g} ms at which {name} is stable at {self.omega:.4g} rad/s'
         if dt > bound:
-            return (
-                f'a step of {1e3 * dt:.3g} ms is above the {1e3 * bound:.3g} ms at which {name} '
-                f'is stable at {self.omega:.4g} rad/s'
-            )
+            return f'a step of {1e3 * dt:.3g} ms is above {limit}'
         inverted = self.inverted
         if inverted:
-            return f'{inverted} of {len(self.mesh.tetrahedra)} tetrahedra are inside out'
-        return (
-            f'a step of {1e3 * dt:.3g} ms is below the {1e3 * bound:.3g} ms at which {name} is '
-            f'stable, so the tissue has been deformed beyond what the {self.model.name} model bears'
-        )
+            cause = f'{inverted} of {len(self.mesh.tetrahedra)} tetrahedra are inside out'
+        else:
+            cause = f'the tissue has been deformed beyond what the {self.model.name} model bears'
+        if np.isinf(bound):
+            return f'{cause}; {name} is stable with any step'
+        return f'{cause}; the step of {1e3 * dt:.3g} ms is below {limit}'
 
     def apply_cut(self, delta: TopologyDelta) -> Touched:
         """Carries a change of connectivity out; displacement and velocity are interpolated.
