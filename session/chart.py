@@ -9,11 +9,16 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from session.chart_front import front_table
 from session.chart_measure import Point, measure, yardstick
-from session.chart_picture import draw
+from session.chart_picture import draw, draw_regions
 from session.chart_problems import ALPHA, BETA, Problem, static_problems
+from session.chart_region import ALPHA as REGION_ALPHA
+from session.chart_region import BETA as REGION_BETA
+from session.chart_region import LocalPalpation, describe
 from session.chart_vibration import Vibration
 from session.errors import SessionError
+from tissue_sim.active_region import ActiveSettings
 from tissue_sim.dynamics import TimeStepping
 from tissue_sim.settings import TissueSettings
 
@@ -24,6 +29,9 @@ DEFAULT = (
     TissueSettings.model_fields['integrator'].default,
 )
 """Of a scene that says nothing."""
+
+NO_REGION = describe(ActiveSettings(TissueSettings.model_fields['active_region'].default.mode))
+"""The active region of such a scene."""
 
 _PAGE = """# Speed against accuracy
 
@@ -41,9 +49,16 @@ no other lies below and to the left of it. Those are joined by the grey line. Al
   integrator matters in free vibration only.
 - The damping is alpha {alpha:g} 1/s and beta {beta:g} s, none in free vibration, where forward
   Euler has no stable step and is missing. Implicit steps last a frame, 33 ms; in free vibration
-  they are also shown with 4 and 16 steps a frame.
+  they are also shown with 4 and 16 steps a frame. Under the active region it is
+  alpha {region_alpha:g} 1/s and beta {region_beta:g} s, as in the scenes.
 
 {panels}
+## The methods of the scenes
+
+On the panels that are what a scene does, is its method on the front: on no mesh is another one
+faster and as near, and on one of them it is on the front of all?
+
+{front}
 """
 
 
@@ -90,6 +105,7 @@ def write_chart(folder: Path, points: list[Point], yardsticks: tuple[float, floa
         figure = draw(problem.title, problem.reference_name, own, text, THESIS, DEFAULT)
         figure.savefig(charts / f'{problem.name}.png', dpi=110)
         panels.append(_panel(problem, text))
+    panels.append(_region_panel(charts, [p for p in points if p.problem == LocalPalpation.name]))
     page = _PAGE.format(
         safety=TimeStepping().safety,
         machine=_machine(),
@@ -97,12 +113,39 @@ def write_chart(folder: Path, points: list[Point], yardsticks: tuple[float, floa
         after=yardsticks[1],
         alpha=ALPHA,
         beta=BETA,
+        region_alpha=REGION_ALPHA,
+        region_beta=REGION_BETA,
         panels='\n'.join(panels),
+        front=front_table(points),
     )
     (folder / 'charts.md').write_text(page, encoding='utf-8')
 
 
-def _panel(problem: Problem | Vibration, text: str) -> str:
+def _region_panel(charts: Path, own: list[Point]) -> str:
+    problem = LocalPalpation()
+    text = region_sentence(own)
+    figure = draw_regions(problem.title, problem.reference_name, own, text, NO_REGION)
+    figure.savefig(charts / f'{problem.name}.png', dpi=110)
+    return _panel(problem, text)
+
+
+def region_sentence(points: list[Point]) -> str:
+    """What the panel of the active region shows: each region on the finest mesh."""
+    finest = [p for p in points if p.resolution == max(q.resolution for q in points)]
+    whole = next(p for p in finest if p.region == NO_REGION)
+    said = [
+        f'{p.region}: {100 * p.displacement_error:.2g} % and '
+        f'{p.cpu_per_second / whole.cpu_per_second:.2g}'
+        for p in finest
+        if p is not whole
+    ]
+    return (
+        f'Error, and CPU time by that of all nodes, on {whole.tetrahedra} tetrahedra, where the '
+        f'step alone errs by {100 * whole.displacement_error:.2g} %: {"; ".join(said)}.'
+    )
+
+
+def _panel(problem: Problem | Vibration | LocalPalpation, text: str) -> str:
     return (
         f'## {problem.title}\n\n![{problem.title}: error against CPU time]'
         f'(charts/{problem.name}.png)\n\n{text} Reference: {problem.reference_name}.\n'

@@ -8,6 +8,7 @@ import numpy as np
 
 from session.chart_meshes import kuhn_block
 from session.chart_problems import AfterCut, Problem, Rest, material, static_problems
+from session.chart_region import LocalPalpation, describe
 from session.chart_vibration import Vibration
 from tissue_sim.coupling import Coupling
 from tissue_sim.dynamics import Dynamics, TimeStepping
@@ -21,7 +22,7 @@ _FEWEST, _MOST, _PATIENCE = 3, 9, 0.5
 """Frames that are timed, and CPU time after which no more are [s]."""
 _NUDGE = 1e-6
 """[m/s] that wakes a tissue which has come to rest."""
-_SAME = 1.01
+SAME = 1.01
 """Ratio of errors that counts as none: models that agree on a problem differ by rounding."""
 _IMPLICIT_SUBSTEPS = (1, 4, 16)
 """Steps a frame of the implicit integrator in free vibration: its accuracy, not stability."""
@@ -37,6 +38,7 @@ class Point:
         cpu_per_second: CPU time for a second of simulated time [s/s].
         displacement_error, force_error: relative.
         front: no other point of the problem is cheaper and as near or nearer.
+        region: the active region: off, on with its tolerance [m/s], budget with its nodes.
     """
 
     problem: str
@@ -50,6 +52,7 @@ class Point:
     displacement_error: float
     force_error: float
     front: bool = False
+    region: str = 'off'
 
 
 def measure(
@@ -64,8 +67,8 @@ def measure(
     points: list[Point] = []
     for problem in static_problems():
         points += with_front(_static(problem, progress, coarse))
-    vibration = Vibration()
-    return points + with_front(_vibration(vibration, progress, coarse))
+    points += with_front(_vibration(Vibration(), progress, coarse))
+    return points + with_front(_palpation(LocalPalpation(), progress, coarse))
 
 
 def _static(problem: Problem, progress: Callable[[str], None], coarse: bool) -> list[Point]:
@@ -151,13 +154,41 @@ def _vibration(problem: Vibration, progress: Callable[[str], None], coarse: bool
     return points
 
 
+def _palpation(
+    problem: LocalPalpation, progress: Callable[[str], None], coarse: bool
+) -> list[Point]:
+    points = []
+    for resolution in problem.resolutions[: 1 if coarse else None]:
+        tetrahedra = len(problem.mesh(resolution).tetrahedra)
+        for active in problem.regions(resolution):
+            region = describe(active)
+            progress(f'{problem.title}, {region}, resolution {resolution}')
+            errors, course = problem.palpate(resolution, active)
+            points.append(
+                Point(
+                    problem.name,
+                    problem.model,
+                    problem.integrator,
+                    resolution,
+                    tetrahedra,
+                    1e3 * course.step,
+                    round(1 / TimeStepping().rate / course.step),
+                    course.cost,
+                    errors.displacement,
+                    errors.force,
+                    region=region,
+                )
+            )
+    return points
+
+
 def with_front(points: list[Point]) -> list[Point]:
     """The same points of one problem, with those on the front marked as such."""
 
     def beaten(point: Point) -> bool:
         return any(
             other.cpu_per_second < point.cpu_per_second
-            and other.displacement_error < _SAME * point.displacement_error
+            and other.displacement_error < SAME * point.displacement_error
             for other in points
         )
 

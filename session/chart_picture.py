@@ -14,6 +14,8 @@ _COLOURS = {
     'corotational': '#cc6677',
     'corotational_smoothed': '#882255',
 }
+_REGIONS = {'off': 'o', 'on': '^', 'budget': 's'}
+_JOINED = 'front: nothing is\ncheaper and nearer'
 _MARKERS = {'euler': 'v', 'symplectic_euler': 'o', 'rk4': 's', 'implicit': 'D'}
 
 
@@ -34,8 +36,7 @@ def draw(
         sentence: what it shows, written under it.
         thesis, default: model and integrator that are marked.
     """
-    figure = Figure(figsize=(9.0, 6.4), layout='constrained')
-    axes = figure.subplots()
+    figure, axes = _panel(title, reference, points, sentence)
     for model, colour in _COLOURS.items():
         for integrator, marker in _MARKERS.items():
             own = [p for p in points if (p.model, p.integrator) == (model, integrator)]
@@ -52,6 +53,62 @@ def draw(
             )
     _mark(axes, points, thesis, 'black', 210)
     _mark(axes, points, default, '#ddaa33', 330)
+    axes.legend(handles=_legend(thesis, default), fontsize=8, loc='upper left',
+                bbox_to_anchor=(1.01, 1.0))  # fmt: skip
+    return figure
+
+
+def draw_regions(
+    title: str, reference: str, points: list[Point], sentence: str, default: str
+) -> Figure:
+    """The same for active regions: a line by mesh, a symbol by region.
+
+    Args:
+        title, reference, points, sentence: as for `draw`.
+        default: region that is marked.
+    """
+    figure, axes = _panel(title, reference, points, sentence)
+    entries = []
+    for resolution, colour in zip(
+        sorted({p.resolution for p in points}), _COLOURS.values(), strict=False
+    ):
+        mesh = [p for p in points if p.resolution == resolution]
+        for kind, marker in _REGIONS.items():
+            own = [p for p in mesh if p.region.split()[0] == kind]
+            own.sort(key=lambda p: p.displacement_error)
+            axes.plot(
+                [p.cpu_per_second for p in own],
+                [100 * p.displacement_error for p in own],
+                marker=marker, color=colour, lw=0.7, ms=7, alpha=0.85,
+            )  # fmt: skip
+            for p in own:
+                axes.annotate(
+                    p.region, (p.cpu_per_second, 100 * p.displacement_error), fontsize=7,
+                    xytext=(6, 2), textcoords='offset points', color='0.3',
+                )  # fmt: skip
+        label = f'{mesh[0].tetrahedra} tetrahedra'
+        entries.append(Line2D([], [], color=colour, lw=3, label=label))
+    _ring(axes, [p for p in points if p.region == default], '#ddaa33', 330)
+    entries += [
+        Line2D([], [], color='0.3', marker=m, lw=0, label=text)
+        for m, text in zip(
+            _REGIONS.values(),
+            ('off: all nodes', 'on: tolerance [m/s]', 'budget: nodes'),
+            strict=True,
+        )
+    ]
+    ring = Line2D([], [], color='#ddaa33', marker='o', lw=0, ms=12, mfc='none', mew=1.8)
+    ring.set_label(f'default: {default}')
+    joined = Line2D([], [], color='0.75', lw=5, label=_JOINED)
+    axes.legend(handles=[*entries, ring, joined], fontsize=8, loc='upper left',
+                bbox_to_anchor=(1.01, 1.0))  # fmt: skip
+    return figure
+
+
+def _panel(title: str, reference: str, points: list[Point], sentence: str) -> tuple[Figure, Any]:
+    """Axes, the front behind everything, the sentence under it."""
+    figure = Figure(figsize=(9.0, 6.4), layout='constrained')
+    axes = figure.subplots()
     front = sorted((p for p in points if p.front), key=lambda p: p.cpu_per_second)
     axes.plot(
         [p.cpu_per_second for p in front],
@@ -70,16 +127,17 @@ def draw(
     axes.set_xlabel('CPU time for one second of simulated time [s/s]')
     axes.set_ylabel(f'error of the displacement [%]\nagainst {reference}', fontsize=9)
     axes.grid(which='both', lw=0.3, alpha=0.5)
-    axes.legend(handles=_legend(thesis, default), fontsize=8, loc='upper left',
-                bbox_to_anchor=(1.01, 1.0))  # fmt: skip
     figure.supxlabel('\n'.join(textwrap.wrap(sentence, 118)), fontsize=9, x=0.02, ha='left')
-    return figure
+    return figure, axes
 
 
 def _mark(
     axes: Any, points: list[Point], method: tuple[str, str], colour: str, size: float
 ) -> None:
-    own = [p for p in points if (p.model, p.integrator) == method]
+    _ring(axes, [p for p in points if (p.model, p.integrator) == method], colour, size)
+
+
+def _ring(axes: Any, own: list[Point], colour: str, size: float) -> None:
     axes.scatter(
         [p.cpu_per_second for p in own],
         [100 * p.displacement_error for p in own],
@@ -101,6 +159,5 @@ def _legend(thesis: tuple[str, str], default: tuple[str, str]) -> list[Line2D]:
         ring = Line2D([], [], color=colour, marker='o', lw=0, ms=12, mfc='none', mew=1.8)
         ring.set_label(label)
         entries.append(ring)
-    joined = 'front: nothing is\ncheaper and nearer'
-    entries.append(Line2D([], [], color='0.75', lw=5, label=joined))
+    entries.append(Line2D([], [], color='0.75', lw=5, label=_JOINED))
     return entries

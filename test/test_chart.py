@@ -8,10 +8,12 @@ import pytest
 
 from bench.reproduction import block_100, block_258, efficiency, orders
 from session.chart import THESIS, cost_for, sentence, write_chart
+from session.chart_front import PANELS, beaten, read_points, scene_methods
 from session.chart_measure import Point, cpu_per_second, with_front
 from session.chart_meshes import end_load, kuhn_block
 from session.chart_problems import AfterCut, Cantilever, static_problems
 from session.chart_reference import HexGrid, Solid, exact_beam, extrapolated, graded
+from session.chart_region import LocalPalpation, describe
 from session.chart_vibration import Vibration
 from session.scene import load_scene
 from session.stability_report import highest_mode, measured_limit
@@ -106,6 +108,22 @@ def test_only_what_nothing_beats_in_both_is_on_the_front() -> None:
     assert front == [False, False, True, True]
 
 
+@pytest.mark.parametrize('scene', scene_methods())
+def test_the_method_of_each_shipped_scene_lies_on_the_front_of_the_chart(scene: str) -> None:
+    points = read_points(Path(__file__).parents[1] / 'docs' / 'charts' / 'points.csv')
+    for problem in PANELS[scene]:
+        assert not beaten(points, problem, scene_methods()[scene])
+
+
+def test_a_method_that_another_beats_is_named_with_what_beats_it() -> None:
+    points = with_front([*POINTS, point('corotational', 'symplectic_euler', 2, 0.04, 0.09)])
+    why = beaten(points, 'cantilever_0.47', ('linear_smoothed', 'symplectic_euler'))
+    assert why == ['corotational by symplectic_euler is faster and as near with 48 tetrahedra']
+    why = beaten(points, 'cantilever_0.47', ('linear', 'rk4'))
+    assert 'another method on another mesh is faster and as near' in why[-1]
+    assert beaten(points, 'indentation', ('linear', 'rk4')) == ['it has not been measured there']
+
+
 def test_the_cost_of_an_error_is_read_off_the_line_of_a_method() -> None:
     line = POINTS[:2]
     assert cost_for(line, 0.2) == pytest.approx(0.4)
@@ -121,6 +139,10 @@ def test_page_table_and_a_picture_by_panel_are_written(tmp_path: Path) -> None:
 
     names = [problem.name for problem in (*static_problems(), Vibration())]
     points = with_front([replace(p, problem=name) for name in names for p in POINTS])
+    names.append(LocalPalpation.name)
+    points += with_front(
+        [replace(POINTS[3], problem=names[-1], region=r) for r in ('off', 'on 0.001', 'budget 9')]
+    )
     write_chart(tmp_path, points, (6.0, 6.1))
     page = (tmp_path / 'charts.md').read_text()
     for name in names:
@@ -130,6 +152,17 @@ def test_page_table_and_a_picture_by_panel_are_written(tmp_path: Path) -> None:
         rows = list(csv.DictReader(table))
     assert len(rows) == len(points)
     assert {(row['model'], row['integrator']) for row in rows} >= {THESIS}
+
+
+def test_an_active_region_errs_less_with_a_smaller_tolerance_and_with_more_nodes() -> None:
+    problem = LocalPalpation()
+    regions = {describe(active): active for active in problem.regions(2)}
+    errors = {name: problem.palpate(2, active)[0] for name, active in regions.items()}
+    on, budget = ([e for n, e in errors.items() if n.startswith(k)] for k in ('on', 'budget'))
+    assert on[0].displacement > on[1].displacement
+    assert on[2].displacement == pytest.approx(errors['off'].displacement, rel=0.2)
+    assert budget[0].displacement > budget[1].displacement > budget[2].displacement
+    assert errors['off'].displacement < 0.06
 
 
 @pytest.mark.parametrize('model', ['linear', 'corotational_smoothed'])

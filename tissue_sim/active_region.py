@@ -17,7 +17,9 @@ from tissue_sim.elasticity import ElasticModel, Operands, internal_force
 from tissue_sim.rotation import LANES
 
 _BLOCK = 4
-"""Substeps between two choices."""
+"""Substeps between two choices while some nodes sleep."""
+_BLOCK_AWAKE = 16
+"""The same while none does, and none can be missed."""
 _RINGS = 2
 """Neighbours of neighbours that a moving node keeps awake."""
 _PATIENCE = 6
@@ -60,9 +62,11 @@ def _spread(tetrahedra, marked):
 
 
 @njit(cache=True)
-def _measure(f, v, inverse_mass, seconds, tolerance, quiet):
-    """Counts for how many choices each node has been slow and in balance."""
+def _measure(f, v, inverse_mass, seconds, tolerance, looked, quiet):
+    """Counts for how many choices the nodes that are looked at have been slow and in balance."""
     for i in range(quiet.shape[0]):
+        if not looked[i]:
+            continue
         speed = gain = 0.0
         for k in range(3 * i, 3 * i + 3):
             speed += v[k] * v[k]
@@ -99,22 +103,24 @@ class ActiveRegion:
     def __init__(self, model: ElasticModel, settings: ActiveSettings, *, implicit: bool) -> None:
         self._model = model
         self._settings = settings
-        self._steps = 1 if implicit else _BLOCK
+        self._implicit = implicit
         self._rings = 4 * _RINGS if implicit else _RINGS
         self._quiet = np.zeros(model.mesh.node_count, np.int64)
         self._awake = np.ones(model.mesh.node_count, bool)
+        self._near = self._awake
 
     @property
     def count(self) -> int:
         """How many nodes move."""
         return int(self._awake.sum())
 
-    def blocks(self, substeps: int) -> list[int]:
-        """Numbers of substeps between choices, for a frame of some."""
+    def ahead(self, left: int) -> int:
+        """Substeps until the next choice, of some that are left in the frame."""
         if self._settings.mode == 'off':
-            return [substeps]
-        size = self._steps
-        return [min(size, substeps - first) for first in range(0, substeps, size)]
+            return left
+        if self._implicit:
+            return 1
+        return min(_BLOCK_AWAKE if self._awake.all() else _BLOCK, left)
 
     def choose(
         self,
@@ -125,6 +131,9 @@ class ActiveRegion:
         seconds: float,
     ) -> Region:
         """Chooses, and stops the nodes that go to sleep.
+
+        Only nodes that move, and their neighbours, are looked at: the force on others is what it
+        was.
 
         Args:
             damped: u + beta v, which the force is taken at [m], shape (3 n,).
@@ -137,22 +146,39 @@ class ActiveRegion:
         whole = self._model.operands()
         if self._settings.mode == 'off':
             return Region(whole.awake, whole)
+        tetrahedra = self._model.mesh.tetrahedra
+        looked = self._near.copy()
+        looked[coupling.nodes] = True
         f = np.empty(3 * n)
-        internal_force(whole, damped, f, 1)
-        _measure(f, v, inverse_mass, seconds, self._settings.tolerance, self._quiet)
+        if looked.all():
+            internal_force(whole, damped, f, 1)
+        else:
+            around = looked.copy()
+            _spread(tetrahedra, around)
+            internal_force(self._needed(looked, around), damped, f, 1)
+        tolerance = self._settings.tolerance
+        _measure(f, v, inverse_mass, seconds, tolerance, looked, self._quiet)
         awake = self._quiet < _PATIENCE
         awake[coupling.nodes] = True
-        tetrahedra = self._model.mesh.tetrahedra
         for _ in range(self._rings):
             _spread(tetrahedra, awake)
         if self._settings.mode == 'budget' and awake.sum() > self._settings.nodes:
             awake = self._nearest(awake, v, coupling)
+            self._quiet[~awake] = _PATIENCE  # they sleep: their neighbours may wake them
         v.reshape(-1, 3)[~awake] = 0.0
         self._awake = awake
-        near = awake.copy()
-        _spread(tetrahedra, near)
-        chunks = _chunks(tetrahedra, awake) if self._model.rotating else np.zeros(0, np.int64)
-        return Region(_spans(awake), self._model.operands(_spans(near), chunks))
+        self._near = awake.copy()
+        _spread(tetrahedra, self._near)
+        if awake.all():
+            return Region(whole.awake, whole)
+        return Region(_spans(awake), self._needed(awake, self._near))
+
+    def _needed(self, marked: np.ndarray, near: np.ndarray) -> Operands:
+        """What the forces on marked nodes need; `near`: they and their neighbours, shape (n,)."""
+        chunks = np.zeros(0, np.int64)
+        if self._model.rotating:
+            chunks = _chunks(self._model.mesh.tetrahedra, marked)
+        return self._model.operands(_spans(near), chunks)
 
     def _nearest(self, awake: np.ndarray, v: np.ndarray, coupling: Coupling) -> np.ndarray:
         """Of the nodes awake those nearest to the tool; without a tool the fastest."""
@@ -175,3 +201,4 @@ class ActiveRegion:
         quiet[:known] = self._quiet[:known]
         quiet[nodes] = 0
         self._quiet = quiet
+        self._awake = self._near = np.ones(n, bool)

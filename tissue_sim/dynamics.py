@@ -239,7 +239,7 @@ class Dynamics:
             self._still = 0
         spring = coupling.spring(self.mesh.rest)
         work, done = 0.0, 0
-        for steps in self._active.blocks(substeps):
+        while done < substeps:
             region = self._active.choose(
                 self._u[:size] + self.material.beta * moving,
                 moving,
@@ -247,6 +247,7 @@ class Dynamics:
                 coupling,
                 self._frame_time,
             )
+            steps = self._active.ahead(substeps - done)
             work += self._integrator.step(
                 region.operands,
                 self.inverse_mass,
