@@ -1,7 +1,6 @@
 """Explicit time steps of M u'' + (alpha M + beta K) u' + K u = f; K u is any model's force.
 
-Damping costs no force evaluation of its own: the force is taken at u + beta v. All kernels have one
-signature, that of `euler_steps`.
+Damping costs no force evaluation of its own: the force is taken at u + beta v.
 """
 
 import numpy as np
@@ -38,12 +37,12 @@ def _stage(f, inverse_mass, u, v, us, vs, du, dv, alpha, share, ahead):
 
 @njit(cache=True, error_model='numpy')
 def euler_steps(
-    operands, spans, inverse_mass, damping, spring, u, v, work, dt, first, steps, total
+    operands, spans, inverse_mass, damping, spring, u, v, work, dt, first, steps, total, symplectic
 ):
-    """Forward Euler (thesis 4.4.1): u and v by their rates at the start of the step.
+    """Euler's methods: v by its rate at the start of the step, u by the v of its start or end.
 
-    The coupling spring is damped with the tissue's beta: forward Euler makes any spring without
-    damping swing up.
+    Forward Euler (thesis 4.4.1) makes any spring without damping swing up, so it damps the coupling
+    spring with the tissue's beta.
 
     Args:
         operands: of the model, see `elasticity.Operands`.
@@ -55,12 +54,14 @@ def euler_steps(
         work: scratch, shape (6, >= 3 n).
         dt: step [s].
         first, steps, total: number of the first step, how many, and how many a frame has.
+        symplectic: whether u goes by the new v; else by the old one, which is forward Euler.
 
     Returns:
         Work of the spring on the tissue [J].
     """
     alpha, beta = damping[0], damping[1]
     q, f = work[2, : u.shape[0]], work[3, : u.shape[0]]
+    held = u if symplectic else q
     force, last = np.zeros(3), np.zeros((2, 3))
     done = start_of_work(spring, u, last)
     q[:] = u
@@ -70,45 +71,18 @@ def euler_steps(
             _ahead(q[a:b], u[a:b], v[a:b], beta)
         internal_force(operands, q, f, 1)
         if spring.mode != 0:
-            subtract_spring(spring, step / total, q, f, force)
-            # Of the spring alone: what its damping takes away, the tissue has not been given.
-            force_of_spring(spring, step / total, u, force)
+            subtract_spring(spring, step / total, held, f, force)
+            if not symplectic:
+                # Of the spring alone: what its damping takes away, the tissue has not been given.
+                force_of_spring(spring, step / total, u, force)
             done += spring_work(spring, force, u, last)
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-            u[a:b] += dt * v[a:b]
+            if not symplectic:
+                u[a:b] += dt * v[a:b]
             _accelerate(v[a:b], f[a:b], inverse_mass[a:b], alpha, dt)
-    if spring.mode != 0:
-        force_of_spring(spring, (first + steps) / total, u, force)
-        done += spring_work(spring, force, u, last)
-    return done
-
-
-@njit(cache=True, error_model='numpy')
-def symplectic_euler_steps(
-    operands, spans, inverse_mass, damping, spring, u, v, work, dt, first, steps, total
-):
-    """Symplectic Euler: v by its rate at the start of the step, u by the new v.
-
-    Arguments and result: see `euler_steps`.
-    """
-    alpha, beta = damping[0], damping[1]
-    q, f = work[2, : u.shape[0]], work[3, : u.shape[0]]
-    force, last = np.zeros(3), np.zeros((2, 3))
-    done = start_of_work(spring, u, last)
-    q[:] = u
-    for step in range(first, first + steps):
-        for s in range(spans.shape[0]):
-            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-            _ahead(q[a:b], u[a:b], v[a:b], beta)
-        internal_force(operands, q, f, 1)
-        if spring.mode != 0:
-            subtract_spring(spring, step / total, u, f, force)
-            done += spring_work(spring, force, u, last)
-        for s in range(spans.shape[0]):
-            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-            _accelerate(v[a:b], f[a:b], inverse_mass[a:b], alpha, dt)
-            u[a:b] += dt * v[a:b]
+            if symplectic:
+                u[a:b] += dt * v[a:b]
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)

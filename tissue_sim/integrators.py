@@ -6,17 +6,11 @@ import numpy as np
 
 from tissue_sim.coupling import Spring
 from tissue_sim.elasticity import Operands
-from tissue_sim.explicit import euler_steps, rk4_steps, symplectic_euler_steps
+from tissue_sim.explicit import euler_steps, rk4_steps
 from tissue_sim.implicit import implicit_steps
 
 IntegratorName = Literal['euler', 'symplectic_euler', 'rk4', 'implicit']
 INTEGRATORS: tuple[IntegratorName, ...] = get_args(IntegratorName)
-
-_EXPLICIT = {
-    'euler': euler_steps,
-    'symplectic_euler': symplectic_euler_steps,
-    'rk4': rk4_steps,
-}
 
 
 class Integrator:
@@ -77,4 +71,6 @@ class Integrator:
         tail = (u, v, self._work, dt, first, steps, count)
         if self.name == 'implicit':
             return float(implicit_steps(*head, diagonal, self._tolerance, *tail))
-        return float(_EXPLICIT[self.name](*head, *tail))
+        if self.name == 'rk4':
+            return float(rk4_steps(*head, *tail))
+        return float(euler_steps(*head, *tail, self.name == 'symplectic_euler'))

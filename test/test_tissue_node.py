@@ -1,0 +1,106 @@
+"""Claims about the running node `tissue_sim`, under a tool that this test plays."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from cutting_trainer_msgs.msg import Contact, ForceSample
+from live import free_domain, two_presses, wait_for, write_scene
+
+from session.graph import node_environment
+from session.scene import load_scene
+from tissue_sim import ros
+from tissue_sim.assembly import make_task
+
+pytestmark = pytest.mark.real_time
+
+ROOT = Path(__file__).parents[1]
+
+
+class Tool:
+    """A sphere over the middle of the largest triangle of the top, as the bridge reports it."""
+
+    def __init__(self, scene: Path, domain: int) -> None:
+        mesh = make_task(load_scene(str(scene)).tissue).mesh
+        corners = mesh.rest[mesh.triangles]
+        top = corners[:, :, 2].min(axis=1)
+        self._nodes = mesh.triangles[int(top.argmax())]
+        self._point = mesh.rest[self._nodes].mean(axis=0)
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self._node = rclpy.create_node('tool', context=self._context)
+        self._contacts = self._node.create_publisher(Contact, ros.CONTACT, ros.STREAM)
+        self._forces = ros.polled(self._node, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
+        self.sequence = 0
+
+    def at(self, depth: float) -> Any:
+        """Says that the tool is so deep [m]; the newest force, or None if there is no new one."""
+        self.sequence += 1
+        up = np.array([0.0, 0.0, 1.0])
+        surface = self._point + 0.004 * up
+        message = Contact(state=Contact.TOUCHING, sequence=self.sequence)
+        message.nodes = np.array([*self._nodes, *[0] * 6], np.uint32)
+        message.weights = np.array([1 / 3] * 3 + [0.0] * 6)
+        message.point, message.proxy = self._point, surface
+        message.normal, message.device = up, surface - depth * up
+        message.coupling_stiffness, message.proxy_radius = 200.0, 0.004
+        message.blade_tip, message.blade_root = message.device, message.device + 0.02 * up
+        self._contacts.publish(message)
+        return ros.take(self._forces)
+
+    def close(self) -> None:
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+@pytest.fixture
+def tool(tmp_path: Path) -> Iterator[Tool]:
+    domain, scene = free_domain(), write_scene(tmp_path, two_presses(), 7.0, 20.0)
+    with (tmp_path / 'log').open('w') as log:
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'tissue_sim.node', '--ros-args', '-p', f'scene:={scene}'],
+            cwd=ROOT,
+            env=node_environment(domain),
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
+        tool = Tool(scene, domain)
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == 'ready: tissue_sim\n'
+            yield tool
+        finally:
+            tool.close()
+            process.kill()
+            process.wait()
+
+
+def test_a_tool_that_jumps_is_felt_no_more_and_the_log_says_why(tool: Tool, tmp_path: Path) -> None:
+    def pressed() -> Any:
+        sample = tool.at(0.003)
+        return sample is not None and sample.force[2] > 0.05
+
+    wait_for(pressed, 'a force')
+    jump = tool.sequence + 1
+
+    def after_the_jump() -> Any:
+        sample = tool.at(0.3)
+        return sample if sample is not None and sample.contact_sequence >= jump else None
+
+    assert not wait_for(after_the_jump, 'the frame of the jump').force.any()
+    wait_for(
+        lambda: 'the tool has moved by 297 mm within a frame' in (tmp_path / 'log').read_text(),
+        'the reason',
+    )
+
+    def felt_again() -> Any:
+        sample = tool.at(0.002)
+        return sample is not None and sample.force[2] > 0.03
+
+    wait_for(felt_again, 'a force')
