@@ -106,6 +106,7 @@ def test_the_step_bound_separates_decay_from_growth(integrator, beta: float) -> 
 
 
 def test_step_bounds_are_those_of_textbooks() -> None:
+    assert step_bound('rk4', 700.0, 0.0, 0.0) == pytest.approx(2 * np.sqrt(2) / 700, rel=1e-5)
     assert step_bound('symplectic_euler', 700.0, 0.0, 0.0) == pytest.approx(2 / 700, rel=1e-5)
     assert step_bound('euler', 700.0, 0.0, 0.0) == 0.0
     assert step_bound('euler', 700.0, 5.0, 1e-4) == pytest.approx(1e-4 + 5 / 700**2, rel=1e-3)

@@ -1,4 +1,4 @@
-"""Linear elasticity by node and edge tensors, lumped mass, RK4: exact solutions and orders."""
+"""Linear elasticity by node and edge tensors, its bound of the frequency, a pressed block."""
 
 import numpy as np
 import pytest
@@ -9,39 +9,13 @@ from tissue_sim.elasticity import ElasticModel
 from tissue_sim.integrators import Integrator
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
-from tissue_sim.stability import FrequencyBound, amplification, step_bound
+from tissue_sim.stability import FrequencyBound, step_bound
 
 LIVER = Material(642.55, 0.47, 1050.0, 0.0, 0.0)
 
 
 def model_of(nodes: np.ndarray, tets: np.ndarray, material: Material = LIVER) -> ElasticModel:
     return ElasticModel(TetMesh(nodes, tets), material)
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_an_affine_displacement_leaves_inner_nodes_without_force(seed: int) -> None:
-    nodes, tets = irregular_box((4, 3, 3), 0.01, seed)
-    gradient = np.random.default_rng(seed).normal(size=(3, 3)) * 0.01
-    force = model_of(nodes, tets).force(nodes @ gradient.T)
-    inner = ((nodes > 1e-9) & (nodes < np.array([4, 3, 3]) * 0.01 - 1e-9)).all(axis=1)
-    assert inner.any()
-    assert np.abs(force[inner]).max() < 1e-12 * np.abs(force).max()
-
-
-def test_an_affine_displacement_gives_the_tractions_of_constant_stress() -> None:
-    nodes, tets = irregular_box((3, 3, 3), 0.01, 1)
-    model = model_of(nodes, tets)
-    gradient = np.random.default_rng(1).normal(size=(3, 3)) * 0.01
-    strain = (gradient + gradient.T) / 2
-    stress = 2 * LIVER.lame_mu * strain + LIVER.lame_lambda * np.trace(strain) * np.eye(3)
-    mesh = model.mesh
-    corners = mesh.rest[mesh.triangles]
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    expected = np.zeros_like(nodes)
-    for i in range(3):
-        np.add.at(expected, mesh.triangles[:, i], areas @ stress / 3)
-    force = model.force(nodes @ gradient.T)
-    np.testing.assert_allclose(force, expected, atol=1e-12 * np.abs(expected).max())
 
 
 def test_translation_and_small_rotation_give_no_force() -> None:
@@ -51,16 +25,6 @@ def test_translation_and_small_rotation_give_no_force() -> None:
     assert np.abs(model.force(np.full_like(nodes, 0.01))).max() < 1e-11 * reference
     spin = np.array([[0, -1, 2], [1, 0, -3], [-2, 3, 0]]) * 1e-3
     assert np.abs(model.force(nodes @ spin.T)).max() < 1e-11 * reference
-
-
-def test_stiffness_is_symmetric_with_six_zero_modes_and_no_negative_eigenvalue() -> None:
-    nodes, tets = irregular_box((3, 3, 3), 0.01, 3)
-    model = model_of(nodes, tets)
-    stiffness = model.dense()
-    assert np.array_equal(stiffness, stiffness.T)
-    values = np.linalg.eigvalsh(stiffness)
-    assert np.abs(values[:6]).max() < 1e-10 * values[-1]
-    assert values[6] > 1e-5 * values[-1]
 
 
 def test_the_kernel_multiplies_by_the_dense_matrix() -> None:
@@ -99,44 +63,6 @@ def test_the_lumped_masses_add_up_to_density_times_volume() -> None:
     assert model_of(nodes, tets).mass.sum() == pytest.approx(1050 * 24e-6, rel=1e-12)
 
 
-def free_vibration(dt_share: float, duration_steps: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Displacement after a fixed time in some steps, the exact one, and the energy's drift."""
-    nodes, tets = irregular_box((2, 2, 2), 0.01, 6)
-    model = model_of(nodes, tets)
-    size = nodes.size
-    inverse = np.repeat(1 / model.mass, 3)
-    root = np.sqrt(inverse)
-    squares, modes = np.linalg.eigh(root[:, None] * model.dense() * root)
-    omega = np.sqrt(np.maximum(squares, 0))
-    u0 = np.random.default_rng(6).normal(size=size) * 1e-4
-    dt = dt_share / omega[-1]
-    time = dt * duration_steps
-    amplitudes = modes.T @ (u0 / root)
-    exact = root * (modes @ (amplitudes * np.cos(omega * time)))
-    u, v = u0.copy(), np.zeros(size)
-    before = 0.5 * u @ model.force(u.reshape(-1, 3)).ravel()
-    none = Coupling().spring(nodes)
-    Integrator('rk4', 0.0, 0.0).step(
-        model.operands(), inverse, model.diagonal, none, u, v, dt, duration_steps
-    )
-    after = 0.5 * u @ model.force(u.reshape(-1, 3)).ravel() + 0.5 * (v * v) @ (1 / inverse)
-    return u, exact, after / before - 1
-
-
-def test_rk4_is_of_fourth_order_on_this_system() -> None:
-    errors = []
-    for halvings in range(3):
-        u, exact, _ = free_vibration(0.8 / 2**halvings, 10 * 2**halvings)
-        errors.append(np.abs(u - exact).max())
-    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    assert (orders > 3.7).all() and (orders < 4.5).all()
-
-
-def test_energy_without_damping_drifts_by_less_than_a_thousandth_over_a_hundred_steps() -> None:
-    _, _, drift = free_vibration(0.2, 100)
-    assert -1e-3 < drift <= 1e-12
-
-
 def test_the_frequency_bound_lies_above_the_highest_frequency_and_not_far() -> None:
     for seed in range(4):
         nodes, tets = irregular_box((3, 3, 2), 0.01, seed)
@@ -155,19 +81,6 @@ def test_right_after_a_change_the_bound_is_rigorous() -> None:
     highest = np.sqrt(np.linalg.eigvalsh(root[:, None] * model.dense() * root)[-1])
     bound.update(np.arange(len(nodes)), np.repeat(1 / model.mass, 3))
     assert highest <= bound.omega < 2 * highest
-
-
-@pytest.mark.parametrize('beta', [0.0, 1e-4, 1e-3, 1e-2])
-def test_the_step_bound_separates_decay_from_growth(beta: float) -> None:
-    omega = 700.0
-    dt = step_bound('rk4', omega, 1.0, beta)
-    modes = omega * np.linspace(0.01, 1, 2000)
-    assert amplification('rk4', modes, 1.0, beta, 0.999 * dt).max() <= 1
-    assert amplification('rk4', modes, 1.0, beta, 1.02 * dt).max() > 1
-
-
-def test_without_damping_the_step_bound_is_that_of_the_imaginary_axis() -> None:
-    assert step_bound('rk4', 700.0, 0.0, 0.0) == pytest.approx(2 * np.sqrt(2) / 700.0, rel=1e-5)
 
 
 def pressed(seconds: float, stiffness: float) -> tuple[ElasticModel, np.ndarray, Coupling]:
