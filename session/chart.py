@@ -136,14 +136,15 @@ def region_sentence(points: list[Point]) -> str:
     finest = [p for p in points if p.resolution == max(q.resolution for q in points)]
     whole = next(p for p in finest if p.region == NO_REGION)
     said = [
-        f'{p.region}: {100 * p.displacement_error:.2g} % and '
+        f'{p.region} {100 * p.displacement_error:.2g} %, '
         f'{p.cpu_per_second / whole.cpu_per_second:.2g}'
         for p in finest
         if p is not whole
     ]
     return (
-        f'Error, and CPU time by that of all nodes, on {whole.tetrahedra} tetrahedra, where the '
-        f'step alone errs by {100 * whole.displacement_error:.2g} %: {"; ".join(said)}.'
+        f'With {whole.tetrahedra} tetrahedra all nodes err by '
+        f'{100 * whole.displacement_error:.2g} %, which is the step; by region, error and CPU '
+        f'time over theirs: {"; ".join(said)}.'
     )
 
 

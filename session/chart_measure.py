@@ -68,7 +68,7 @@ def measure(
     for problem in static_problems():
         points += with_front(_static(problem, progress, coarse))
     points += with_front(_vibration(Vibration(), progress, coarse))
-    return points + with_front(_palpation(LocalPalpation(), progress, coarse))
+    return points + _palpation(LocalPalpation(), progress, coarse)
 
 
 def _static(problem: Problem, progress: Callable[[str], None], coarse: bool) -> list[Point]:
@@ -157,14 +157,16 @@ def _vibration(problem: Vibration, progress: Callable[[str], None], coarse: bool
 def _palpation(
     problem: LocalPalpation, progress: Callable[[str], None], coarse: bool
 ) -> list[Point]:
-    points = []
+    """Fronts are those of each mesh: the reference is on the same one."""
+    points: list[Point] = []
     for resolution in problem.resolutions[: 1 if coarse else None]:
+        own = []
         tetrahedra = len(problem.mesh(resolution).tetrahedra)
         for active in problem.regions(resolution):
             region = describe(active)
             progress(f'{problem.title}, {region}, resolution {resolution}')
             errors, course = problem.palpate(resolution, active)
-            points.append(
+            own.append(
                 Point(
                     problem.name,
                     problem.model,
@@ -179,6 +181,7 @@ def _palpation(
                     region=region,
                 )
             )
+        points += with_front(own)
     return points
 
 

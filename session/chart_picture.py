@@ -36,7 +36,8 @@ def draw(
         sentence: what it shows, written under it.
         thesis, default: model and integrator that are marked.
     """
-    figure, axes = _panel(title, reference, points, sentence)
+    figure, axes = _panel(title, reference, sentence)
+    _join(axes, points)
     for model, colour in _COLOURS.items():
         for integrator, marker in _MARKERS.items():
             own = [p for p in points if (p.model, p.integrator) == (model, integrator)]
@@ -61,18 +62,19 @@ def draw(
 def draw_regions(
     title: str, reference: str, points: list[Point], sentence: str, default: str
 ) -> Figure:
-    """The same for active regions: a line by mesh, a symbol by region.
+    """The same for active regions: a line and a front by mesh, a symbol by region.
 
     Args:
         title, reference, points, sentence: as for `draw`.
         default: region that is marked.
     """
-    figure, axes = _panel(title, reference, points, sentence)
+    figure, axes = _panel(title, reference, sentence)
     entries = []
     for resolution, colour in zip(
         sorted({p.resolution for p in points}), _COLOURS.values(), strict=False
     ):
         mesh = [p for p in points if p.resolution == resolution]
+        _join(axes, mesh)
         for kind, marker in _REGIONS.items():
             own = [p for p in mesh if p.region.split()[0] == kind]
             own.sort(key=lambda p: p.displacement_error)
@@ -105,10 +107,8 @@ def draw_regions(
     return figure
 
 
-def _panel(title: str, reference: str, points: list[Point], sentence: str) -> tuple[Figure, Any]:
-    """Axes, the front behind everything, the sentence under it."""
-    figure = Figure(figsize=(9.0, 6.4), layout='constrained')
-    axes = figure.subplots()
+def _join(axes: Any, points: list[Point]) -> None:
+    """A line behind everything through the points on the front."""
     front = sorted((p for p in points if p.front), key=lambda p: p.cpu_per_second)
     axes.plot(
         [p.cpu_per_second for p in front],
@@ -118,6 +118,12 @@ def _panel(title: str, reference: str, points: list[Point], sentence: str) -> tu
         zorder=0,
         solid_capstyle='round',
     )
+
+
+def _panel(title: str, reference: str, sentence: str) -> tuple[Figure, Any]:
+    """Axes, and the sentence under them."""
+    figure = Figure(figsize=(9.0, 6.4), layout='constrained')
+    axes = figure.subplots()
     axes.axvline(1.0, color='0.4', lw=0.8, ls='--')
     axes.annotate(
         'real time on one core', (1.0, 0.02), xycoords=('data', 'axes fraction'), rotation=90,
