@@ -92,7 +92,7 @@ def _write(surface: Geometry, slot: int, weights: np.ndarray, state: np.ndarray)
         s.weights[j] = weights[j]
         s.spread += weights[j] * weights[j]
         for axis in range(3):
-            s.contact[axis] += weights[j] * near.corners[slot, j, axis]
+            s.contact[axis] += weights[j] * near.corners[3 * j + axis, slot]
 
 
 @njit(cache=True, nogil=True)
@@ -116,9 +116,9 @@ def _step_out(
     for axis in range(3):
         s.normal[axis] = s.step[axis]
         if gap > 1e-12:
-            s.normal[axis] = (device[axis] - near.closest[slot, axis]) / gap
+            s.normal[axis] = (device[axis] - near.closest[axis, slot]) / gap
             s.normal[axis] *= -1.0 if inside else 1.0
-    _write(surface, slot, near.weights[slot], state)
+    _write(surface, slot, near.weights[:, slot], state)
     height = -gap if inside else gap
     if height >= radius:
         return
@@ -152,7 +152,7 @@ def _follow(surface: Geometry, blend: float, device: np.ndarray, state: np.ndarr
         slot = _first_crossed(p, goal, slots, held, weights, s.near)
         if slot < 0 or held == 3:
             break
-        planes[held] = near.normal[slot]
+        planes[held] = near.normal[:, slot]
         slots[held] = slot
         held += 1
         goal[:] = _nearest_on(p, device, planes, held, slots, s.near)
@@ -172,7 +172,7 @@ def _follow(surface: Geometry, blend: float, device: np.ndarray, state: np.ndarr
     for axis in range(3):
         s.normal[axis] = s.step[axis] / s.depth
     refresh(p, s.near)
-    _write(surface, slots[0], near.weights[slots[0]], state)
+    _write(surface, slots[0], near.weights[:, slots[0]], state)
 
 
 @njit(cache=True, nogil=True)
@@ -192,11 +192,11 @@ def _first_crossed(
         known = False
         for i in range(held):
             known = known or slots[i] == slot
-        n, corners = near.normal[slot], near.corners[slot]
+        n, corners = near.normal[:, slot], near.corners[:, slot]
         above = below = 0.0
         for axis in range(3):
-            above += n[axis] * (start[axis] - corners[0, axis])
-            below += n[axis] * (end[axis] - corners[0, axis])
+            above += n[axis] * (start[axis] - corners[axis])
+            below += n[axis] * (end[axis] - corners[axis])
         if known or below >= 0.5 * _SKIN or above < -_SKIN or above - below <= 1e-15:
             continue
         t = max(above, 0.0) / (above - below)
@@ -212,7 +212,8 @@ def _is_within(
 ) -> bool:
     """Whether the point at t of the way lies within a triangle of normal n."""
     for i in range(3):
-        a, b = corners[i], corners[(i + 1) % 3]
+        a, j = corners[3 * i : 3 * i + 3], (i + 1) % 3
+        b = corners[3 * j : 3 * j + 3]
         e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
         q0 = start[0] + t * (end[0] - start[0]) - a[0]
         q1 = start[1] + t * (end[1] - start[1]) - a[1]
@@ -238,7 +239,7 @@ def _nearest_on(
     wanted = np.zeros(held)
     for i in range(held):
         for axis in range(3):
-            wanted[i] += planes[i, axis] * (near.corners[slots[i], 0, axis] - device[axis])
+            wanted[i] += planes[i, axis] * (near.corners[axis, slots[i]] - device[axis])
         wanted[i] += _SKIN
         for j in range(held):
             for axis in range(3):

@@ -33,13 +33,13 @@ def is_inside(surface: Geometry, point: np.ndarray, near: np.ndarray, outward: n
         slot = w.order[ties]
         if w.distance[slot] > w.distance[nearest] + TIED:
             break
-        angle = _angle_at_closest(w.corners[slot], w.weights[slot])
+        angle = _angle_at_closest(w.corners[:, slot], w.weights[:, slot])
         for axis in range(3):
-            outward[axis] += angle * w.normal[slot, axis]
+            outward[axis] += angle * w.normal[axis, slot]
         ties += 1
     height = 0.0
     for axis in range(3):
-        height += outward[axis] * (point[axis] - w.closest[nearest, axis])
+        height += outward[axis] * (point[axis] - w.closest[axis, nearest])
     if height >= 0.0 or _on_rim(surface, ties, near):
         return False
     outward /= norm(outward)
@@ -52,10 +52,11 @@ def _angle_at_closest(corners: np.ndarray, weights: np.ndarray) -> float:
     for j in range(3):
         if weights[j] != 1.0:
             continue
-        a, b = corners[(j + 1) % 3], corners[(j + 2) % 3]
+        a, b = 3 * ((j + 1) % 3), 3 * ((j + 2) % 3)
         ab = aa = bb = 0.0
         for axis in range(3):
-            u, v = a[axis] - corners[j, axis], b[axis] - corners[j, axis]
+            here = corners[3 * j + axis]
+            u, v = corners[a + axis] - here, corners[b + axis] - here
             ab += u * v
             aa += u * u
             bb += v * v
@@ -68,7 +69,7 @@ def _angle_at_closest(corners: np.ndarray, weights: np.ndarray) -> float:
 def _on_rim(surface: Geometry, ties: int, near: np.ndarray) -> bool:
     """Whether the closest point is on an edge that only one triangle has."""
     w = near[0]
-    weights = w.weights[w.order[0]]
+    weights = w.weights[:, w.order[0]]
     if weights.min() > 0.0:
         return False
     if weights.max() < 1.0:
@@ -76,7 +77,7 @@ def _on_rim(surface: Geometry, ties: int, near: np.ndarray) -> bool:
     for i in range(ties):
         for j in range(3):
             node = surface.triangles[w.triangle[w.order[i]], j]
-            if w.weights[w.order[i], j] == 0.0 and _uses(surface, node, ties, near) < 2:
+            if w.weights[j, w.order[i]] == 0.0 and _uses(surface, node, ties, near) < 2:
                 return True
     return False
 

@@ -110,7 +110,7 @@ class Proxy:
             `touch`.
         """
         self._device[:] = device
-        self.touch.valid = bool(math.isfinite(blend) and np.isfinite(self._device).all())
+        self.touch.valid = all(map(math.isfinite, (blend, *self._device.tolist())))
         if not self.touch.valid:
             return self.touch
         blend = min(max(float(blend), 0.0), 1.0)

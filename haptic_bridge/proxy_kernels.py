@@ -6,7 +6,7 @@ from numba import njit
 from haptic_bridge import half_spaces
 from haptic_bridge.half_spaces import SPACES
 from haptic_bridge.inside import LARGEST_FAN, TIED, is_inside
-from haptic_bridge.neighbourhood import CAPACITY, NEAR, gather, refresh
+from haptic_bridge.neighbourhood import CAPACITY, NEAR, cover, gather, refresh, uncover
 from haptic_bridge.surface import Geometry
 
 PATCHES = 3
@@ -234,40 +234,25 @@ def _linearise(radius: float, state: np.ndarray) -> None:
     """
     s = state[0]
     near, spaces = s.near[0], s.spaces[0]
+    uncover(s.near)
     for place in range(near.count):
         slot = near.order[place]
         if spaces.count == half_spaces.MOST:
             near.reach = min(near.reach, near.distance[slot])
             return
-        if _is_excluded(slot, radius, state):
+        if near.covered[slot] >= 0.0:
             continue
-        q, gap = near.closest[slot], near.distance[slot]
-        x, y, z = near.normal[slot]
+        q, gap = near.closest[:, slot], near.distance[slot]
+        x, y, z = near.normal[0, slot], near.normal[1, slot], near.normal[2, slot]
         if gap > 1e-12:
             x, y, z = (
                 (s.position[0] - q[0]) / gap,
                 (s.position[1] - q[1]) / gap,
                 (s.position[2] - q[2]) / gap,
             )
-        half_spaces.add(s.spaces, x, y, z, radius - gap)
-
-
-@njit(cache=True, nogil=True)
-def _is_excluded(slot: int, radius: float, state: np.ndarray) -> bool:
-    """Whether a half-space keeps the centre a radius away from all of a triangle."""
-    s = state[0]
-    spaces, corners = s.spaces[0], s.near[0].corners[slot]
-    for i in range(spaces.count):
-        n = spaces.normal[i]
-        lowest = np.inf
-        for j in range(3):
-            height = 0.0
-            for axis in range(3):
-                height += n[axis] * (s.position[axis] - corners[j, axis])
-            lowest = min(lowest, height)
-        if lowest >= radius - spaces.bound[i] - _COVERED:
-            return True
-    return False
+        bound = radius - gap
+        half_spaces.add(s.spaces, x, y, z, bound)
+        cover(x, y, z, radius - bound - _COVERED, s.near)
 
 
 @njit(cache=True, nogil=True)
@@ -280,7 +265,7 @@ def _leave_tissue(surface: Geometry, blend: float, radius: float, state: np.ndar
         return False
     nearest = near.order[0]
     for axis in range(3):
-        s.position[axis] = near.closest[nearest, axis] + _ENTRY * radius * s.step[axis]
+        s.position[axis] = near.closest[axis, nearest] + _ENTRY * radius * s.step[axis]
     s.goal[:] = s.position
     _seek(surface, blend, 0.0, radius, radius, state)
     return True
@@ -330,8 +315,8 @@ def _foresee(surface: Geometry, blend: float, radius: float, state: np.ndarray) 
     slot = near.order[0]
     for axis in range(3):
         s.nodes[axis] = surface.triangles[near.triangle[slot], axis]
-        s.weights[axis] = near.weights[slot, axis]
-        s.contact[axis] = near.closest[slot, axis]
+        s.weights[axis] = near.weights[axis, slot]
+        s.contact[axis] = near.closest[axis, slot]
         s.normal[axis] = (s.position[axis] - s.contact[axis]) / near.distance[slot]
 
 
@@ -348,9 +333,9 @@ def _touched(surface: Geometry, within: float, state: np.ndarray) -> int:
             break
         n = s.push_normal[found]
         for axis in range(3):
-            n[axis] = near.normal[slot, axis]
+            n[axis] = near.normal[axis, slot]
             if gap > 1e-12:
-                n[axis] = (s.position[axis] - near.closest[slot, axis]) / gap
+                n[axis] = (s.position[axis] - near.closest[axis, slot]) / gap
         new = True
         for i in range(found):
             m = s.push_normal[i]
@@ -401,8 +386,8 @@ def _write_patches(surface: Geometry, state: np.ndarray) -> None:
         slot = s.push_slot[chosen]
         for axis in range(3):
             s.nodes[3 * patch + axis] = surface.triangles[near.triangle[slot], axis]
-            s.weights[3 * patch + axis] = push * near.weights[slot, axis]
-            s.contact[axis] += push * near.closest[slot, axis]
+            s.weights[3 * patch + axis] = push * near.weights[axis, slot]
+            s.contact[axis] += push * near.closest[axis, slot]
     for i in range(3 * PATCHES):
         s.weights[i] /= total
     s.spread = 0.0
