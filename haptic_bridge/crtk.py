@@ -1,11 +1,19 @@
-"""CRTK over ROS: the operating state's topic, commands and query, and a button to hold."""
+"""CRTK over ROS: the operating state's topic, commands and query, that of the device, and a button
+to hold.
+"""
 
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from sensor_msgs.msg import Joy
 
-from haptic_bridge.operating_state import OperatingStateMachine, State, crtk_types
+from haptic_bridge.operating_state import (
+    OperatingStateMachine,
+    State,
+    crtk_types,
+    device_cause,
+)
 from tissue_sim.ros import EVENTS, LATCHED, introspect
 
 
@@ -59,6 +67,42 @@ class StateInterface:
         )
         message.header.stamp = self._node.get_clock().now().to_msg()
         return message
+
+
+class DeviceState:
+    """Reads `<name>/operating_state` of the device: FAULT at the bridge in all but ENABLED.
+
+    A device without this topic is allowed. One that does not latch it is heard as well, from its
+    next change on.
+
+    Args:
+        node: to subscribe with.
+        name: namespace of the device.
+        machine: of the bridge.
+
+    Attributes:
+        state: what the device has said last; empty before that.
+        cause: why it gives no force, as a sentence; '' if it does or has not said.
+    """
+
+    def __init__(self, node: Node, name: str, machine: OperatingStateMachine) -> None:
+        self.state = self.cause = ''
+        self._machine = machine
+        # That a device does not latch is no reason for a warning of the middleware.
+        quiet = SubscriptionEventCallbacks(
+            incompatible_qos=lambda _: None, use_default_callbacks=False
+        )
+        kind, topic = crtk_types().operating_state, f'{name}/operating_state'
+        self._subscriptions = [
+            node.create_subscription(kind, topic, self._hear, qos, event_callbacks=quiet)
+            for qos in (LATCHED, EVENTS)
+        ]
+
+    def _hear(self, message: Any) -> None:
+        self.state = message.state
+        self.cause = device_cause(message.state, is_homed=message.is_homed)
+        if self.cause and self._machine.state is State.ENABLED:
+            self._machine.fault(self.cause)
 
 
 class HoldButton:

@@ -23,7 +23,8 @@ from haptic_bridge.settings import (
     check_together,
 )
 from haptic_bridge.surface import Surface
-from haptic_bridge.wire import ForceSampleCodec, Sample
+from haptic_bridge.tissue_sample import TissueSample
+from haptic_bridge.wire import Sample
 
 _SECOND = 1e-9
 _LONGEST_STEP = 0.005
@@ -221,46 +222,41 @@ class ForcePath:
     def _take_sample(self, now_ns: int, sample: Sample | None) -> str:
         if sample is None:
             return ''
-        get, values = ForceSampleCodec.fields, sample.values
-        step = int(values[0])
+        said = TissueSample.read(sample)
         fresh = (now_ns - self._sample_ns) * _SECOND <= self.haptics.stale_after
-        if sample.stamp_ns == 0 or (fresh and step <= self._step):
+        if sample.stamp_ns == 0 or (fresh and said.step <= self._step):
             self.rejected += 1
             return ''
-        force = np.array(values[get['force']])
-        stiffness = np.array(values[get['stiffness']]).reshape(3, 3)
-        position = np.array(values[get['position']])
-        if not (safety.force_gate(force, stiffness) and np.isfinite(position).all()):
+        if problem := said.problem:
             self.rejected += 1
             extrapolation.clear(self._history)
-            limit = f'{safety.LARGEST_FORCE:g} N'
-            return f'the tissue force of frame {step} is not finite or above {limit}'
+            return problem
         if not fresh:
             extrapolation.clear(self._history)
-        self._step, self._sample_revision = step, int(values[1])
+        self._step, self._sample_revision = said.step, said.revision
         self._sample_ns = now_ns - _UNNOTICED_NS
-        self._sample_state = int(values[get['state']][0])
-        self._s['resistance'] = values[get['resistance']][0]
-        answered = self._began <= int(values[3]) <= self._sequence and self._contact == TOUCHING
-        if self._sample_state == INSIDE or answered:
-            time = int(values[4]) * 1_000_000_000 + int(values[5])
+        self._sample_state = said.state
+        self._s['resistance'] = said.resistance
+        answered = self._began <= said.sequence <= self._sequence and self._contact == TOUCHING
+        if said.state == INSIDE or answered:
+            there = self._depths[said.sequence % _REMEMBERED]
             extrapolation.push(
                 self._history,
-                time,
-                position,
-                force,
-                stiffness,
-                self._depths[int(values[3]) % _REMEMBERED, :3],
-                self._depths[int(values[3]) % _REMEMBERED, 3],
-                topology=int(values[2]),
-                state=self._sample_state,
+                said.time,
+                said.position,
+                said.force,
+                said.stiffness,
+                there[:3],
+                there[3],
+                topology=said.topology,
+                state=said.state,
             )
-        elif self._contact == NONE and int(values[3]) > self._left:
+        elif self._contact == NONE and said.sequence > self._left:
             # What the tissue says of a place that the tool comes near to.
-            if stiffness.any():
-                self._history['stiffness'] = stiffness
-            if self._sample_state == NONE:
-                self._ground.answered_free(now_ns, self._sample_revision)
+            if said.stiffness.any():
+                self._history['stiffness'] = said.stiffness
+            if said.state == NONE:
+                self._ground.answered_free(now_ns, said.revision)
         return ''
 
     def _begin(self, now_ns: int) -> None:
@@ -368,17 +364,26 @@ class ForcePath:
 
 def warm_up(
     tool: ToolSettings, device: DeviceSettings, haptics: HapticsSettings, profile: DeviceProfile
-) -> None:
-    """Compiles, or loads from the cache, everything that a tick calls."""
-    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+) -> ForcePath:
+    """Compiles, or loads from the cache, everything that a tick calls, by touching a triangle.
+
+    Returns:
+        What has touched it.
+    """
+    frame = device.tissue_from_device
+    place = frame.to_tissue(np.zeros(3))
+    corners = place + np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     triangle = np.array([[0, 1, 2]], np.int32)
     surface = Surface(corners, triangle, revision=0, topology=0)
     path = ForcePath(tool, device, haptics, profile)
-    for i, height in enumerate((2.0, 0.5, -0.001, -0.001, -0.001)):
-        tip = device.tissue_from_device.to_device(np.array([0.0, 0.0, height * tool.radius]))
+    # What is not yet ENABLED cannot jump.
+    states = (State.DISABLED, *(State.ENABLED,) * 4)
+    for i, (state, height) in enumerate(zip(states, (1.01, 1.01, 0.99, 0.99, 0.99), strict=True)):
+        tip = frame.to_device(place + np.array([0.0, 0.0, height * tool.radius]))
         stamp = (i + 1) * 1_000_000
         pose = Sample(stamp, '', (*tip.tolist(), 0.0, 0.0, 0.0, 1.0))
         sample = Sample(stamp, '', (i, i, 0, i, 0, stamp, TOUCHING) + (1e-3,) * 18)
-        path.tick(stamp, state=State.ENABLED, pose=pose, sample=sample, surface=surface)
+        path.tick(stamp, state=state, pose=pose, sample=sample, surface=surface)
         surface = Surface(corners, triangle, revision=i + 1, topology=0, previous=surface)
         corners = corners + 1e-5
+    return path

@@ -15,7 +15,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 
 from haptic_bridge.convention import DeviceConvention
-from haptic_bridge.crtk import HoldButton, StateInterface
+from haptic_bridge.crtk import DeviceState, HoldButton, StateInterface
 from haptic_bridge.force_path import ForcePath, warm_up
 from haptic_bridge.operating_state import OperatingStateMachine, State
 from haptic_bridge.realtime import prepare, run_real_time
@@ -40,6 +40,9 @@ STATE_PERIOD = 0.02
 """[s] between two looks for changes of the operating state."""
 ANSWER_TIMEOUT = 1.0
 """[s] after which a question for the full mesh is asked again."""
+PATIENCE = 0.5
+"""[s] of nothing but old revisions after which they are those of a simulation started again, or the
+revision here was never one."""
 CLOCK_STEP = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
@@ -63,7 +66,8 @@ class SimulationFollower:
         self.gaps = 0
         self._on_error = on_error
         self._replica = MeshReplica()
-        self._stamp = (0, 0)
+        self._stamp = 0
+        self._accepted = 0.0
         self._codec = ForceSampleCodec()
         self._watch = StreamWatch(ros.FORCE)
         self._mesh = ros.polled(node, Mesh, ros.MESH, ros.LATCHED)
@@ -80,15 +84,30 @@ class SimulationFollower:
     def run(self, stop: ros.Stop) -> None:
         """Follows until `stop` is set."""
         while not stop.is_set():
-            try:
-                self.poll()
-            except Exception as error:
-                self._on_error(f'message of the simulation: {error}')
-                self._ask()
+            self.poll()
             time.sleep(FOLLOW_PERIOD)
 
     def poll(self) -> None:
-        """Takes what has arrived."""
+        """Takes what has arrived; what is wrong with one topic keeps none of the others waiting."""
+        for take in (self._take_force, self._take_surface):
+            try:
+                take()
+            except Exception as error:
+                self._on_error(f'message of the simulation: {error}')
+                self._ask()
+
+    def _take_force(self) -> None:
+        taken = ros.take_numbered(self._force)
+        if taken is None:
+            return
+        sample = self._codec.decode(taken[0])
+        _require_frame(ros.FORCE, sample.frame_id)
+        self.samples.append(sample)
+        problem = self._watch.see(taken[1], sample.stamp_ns, time.monotonic_ns())
+        if problem:
+            self._on_error(problem)
+
+    def _take_surface(self) -> None:
         known = self._replica.revision, self._replica.topology
         while (mesh := ros.take(self._mesh)) is not None:
             self._load(mesh)
@@ -98,28 +117,30 @@ class SimulationFollower:
             self._apply(delta)
         if (self._replica.revision, self._replica.topology) != known:
             self._renew()
-        taken = ros.take_numbered(self._force)
-        if taken is not None:
-            sample = self._codec.decode(taken[0])
-            self.samples.append(sample)
-            problem = self._watch.see(taken[1], sample.stamp_ns, time.monotonic_ns())
-            if problem:
-                self._on_error(problem)
 
     def _load(self, mesh: Mesh) -> None:
+        _require_frame(ros.MESH, mesh.header.frame_id)
         # A keyframe can arrive after the deltas that follow it; an older revision of a younger
         # stamp is a simulation that has started again.
-        stamp = (mesh.header.stamp.sec, mesh.header.stamp.nanosec)
-        if mesh.revision > self._replica.revision or stamp > self._stamp:
+        stamp = _nanoseconds(mesh)
+        younger = mesh.revision > self._replica.revision or stamp > self._stamp
+        if younger or self._waits_in_vain():
             self._replica.load(mesh)
-            self._stamp = stamp
+            self._stamp, self._accepted = stamp, time.monotonic()
 
     def _apply(self, delta: MeshDelta) -> None:
-        if self._replica.apply(delta):
-            stamp = (delta.header.stamp.sec, delta.header.stamp.nanosec)
-            self._stamp = max(self._stamp, stamp)
+        _require_frame(ros.MESH_UPDATES, delta.header.frame_id)
+        if delta.revision <= self._replica.revision:
+            if self._waits_in_vain():
+                self._ask()
+        elif self._replica.apply(delta):
+            self._stamp = max(self._stamp, _nanoseconds(delta))
+            self._accepted = time.monotonic()
         elif self._replica.revision >= 0:
             self._ask()
+
+    def _waits_in_vain(self) -> bool:
+        return time.monotonic() - self._accepted > PATIENCE
 
     def _ask(self) -> None:
         now = time.monotonic()
@@ -144,6 +165,18 @@ class SimulationFollower:
             topology=replica.topology,
             previous=self.surface,
         )
+
+
+def _require_frame(topic: str, frame: str) -> None:
+    if frame != ros.FRAME:
+        raise ValueError(
+            f'{topic} has the frame_id {frame!r}, but forces are felt in {ros.FRAME!r}'
+        )
+
+
+def _nanoseconds(message: Mesh | MeshDelta) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
 
 
 class HapticBridge(Node):
@@ -181,6 +214,7 @@ class HapticBridge(Node):
         self._contact = self.create_publisher(Contact, ros.CONTACT, ros.STREAM)
         self._follower = SimulationFollower(self, self._machine.fault)
         self._interface = StateInterface(self, 'haptic_bridge', self._machine)
+        self._device = DeviceState(self, ros.ARM, self._machine)
         self._button = HoldButton(self, ros.ARM, self._machine) if device.hold_button else None
         self._epoch = time.time_ns() - time.monotonic_ns()
         self._stale_trips = 0
@@ -205,7 +239,8 @@ class HapticBridge(Node):
 
     def _cause(self) -> str:
         now = time.monotonic_ns()
-        return self._watch.cause(now) or self._follower.cause(now) or self._path.cause(now)
+        streams = self._watch.cause(now) or self._follower.cause(now)
+        return streams or self._device.cause or self._path.cause(now)
 
     def _tick(self, _late: int) -> None:
         now = time.monotonic_ns()
@@ -235,7 +270,7 @@ class HapticBridge(Node):
         if taken is None:
             return None
         sample = self._pose_codec.decode(taken[0])
-        problem = self._watch.see(taken[1], sample.stamp_ns, now)
+        problem = self._watch.see(taken[1], sample.stamp_ns, now, sample.frame_id)
         if problem and self._machine.state is State.ENABLED:
             self._machine.fault(problem)
         return self._convention.pose(sample)
@@ -252,7 +287,11 @@ class HapticBridge(Node):
             self._epoch = epoch
         if self._button is not None:
             self._button.enforce()
-        if self._auto_enable and self._path.is_fresh(time.monotonic_ns()):
+        if (
+            self._auto_enable
+            and not self._device.cause
+            and self._path.is_fresh(time.monotonic_ns())
+        ):
             self._auto_enable = False
             self._machine.command('enable')
         reason = self._machine.reason
@@ -276,6 +315,7 @@ class HapticBridge(Node):
         publishers = self.count_publishers(self._pose.topic_name)
         values: dict[str, object] = {
             'operating_state': machine.state,
+            'device_state': self._device.state,
             'fault': machine.reason,
             'faults': self._faults,
             'last_fault': self._last_fault,

@@ -101,6 +101,18 @@ class OperatingStateMachine:
         self.state, self.reason = state, reason
 
 
+def device_cause(state: str, *, is_homed: bool) -> str:
+    """Why a device gives no force in an operating state of its own, as a sentence; '' if it does.
+
+    Args:
+        state: as the device names it; anything but ENABLED is no force.
+        is_homed: CRTK's flag: before homing a device does not know where it is.
+    """
+    if state != State.ENABLED:
+        return f'the device says that it is {state or "in no state"}, not ENABLED'
+    return '' if is_homed else 'the device says that it is not homed'
+
+
 class CrtkTypes(NamedTuple):
     """Message and service classes for operating states.
 

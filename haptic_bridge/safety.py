@@ -22,8 +22,6 @@ FARTHEST_DEVICE = 10.0
 """[m] from the origin of the device frame. Millimetres sent as metres exceed it at once."""
 FASTEST_DEVICE = 10.0
 """[m/s]. A thrown hand reaches half of it."""
-LARGEST_FORCE = 1e3
-"""[N] of a sample of the tissue. A simulation that diverges exceeds it long before it overflows."""
 
 
 @njit(cache=True, nogil=True)
@@ -63,12 +61,6 @@ def pose_gate(
     if np.sqrt(moved) > FASTEST_DEVICE * (elapsed + 1e-3):
         return JUMP
     return OK
-
-
-@njit(cache=True, nogil=True)
-def force_gate(force: np.ndarray, stiffness: np.ndarray) -> bool:
-    """Whether a force [N], shape (3,), and its stiffness [N/m], shape (3, 3), can be believed."""
-    return norm(force) <= LARGEST_FORCE and bool(np.all(np.isfinite(stiffness)))
 
 
 @njit(cache=True, nogil=True)

@@ -1,5 +1,5 @@
-"""What a stream of stamped messages gives away about its sender: two of them, or a clock that
-jumps.
+"""What a stream of stamped messages gives away about its sender: two of them, a clock that jumps,
+or a frame that changes.
 """
 
 CLOCK_JUMP = 0.5
@@ -28,19 +28,22 @@ class StreamWatch:
         self._went_back: int | None = None
         self._two_seen: int | None = None
         self._offset: int | None = None
+        self._frame: str | None = None
 
-    def see(self, number: int, stamp_ns: int, now_ns: int) -> str:
+    def see(self, number: int, stamp_ns: int, now_ns: int, frame: str = '') -> str:
         """Takes note of a message.
 
         Args:
             number: that its publisher gave it; 0 where unknown.
             stamp_ns: in its header [ns]; 0 means invalid, and is not looked at.
             now_ns: monotonic clock of the receiver [ns].
+            frame: `header.frame_id`.
 
         Returns:
             What is wrong, as a sentence; '' if nothing is.
         """
-        return self._count(number, now_ns) or self._compare(stamp_ns, now_ns)
+        changed = self._change(frame)
+        return self._count(number, now_ns) or self._compare(stamp_ns, now_ns) or changed
 
     def cause(self, now_ns: int) -> str:
         """Why the stream cannot be trusted at this time [ns], '' if it can."""
@@ -58,6 +61,12 @@ class StreamWatch:
             return ''
         self._two_seen = now_ns
         return self.cause(now_ns)
+
+    def _change(self, frame: str) -> str:
+        before, self._frame = self._frame, frame
+        if before is None or before == frame:
+            return ''
+        return f'the frame_id of {self._topic} changed from {before!r} to {frame!r}'
 
     def _compare(self, stamp_ns: int, now_ns: int) -> str:
         if stamp_ns == 0:

@@ -11,6 +11,8 @@ from numba import njit
 
 LEAF = 4
 """Triangles of a leaf."""
+FARTHEST = 1e3
+"""[m] from the origin of the tissue frame that a node may be."""
 _BITS = 16
 """Of the Morton code along each axis."""
 
@@ -100,11 +102,12 @@ class Surface:
 
 
 def _check(positions: np.ndarray, triangles: np.ndarray, revision: int) -> None:
-    if not np.isfinite(positions).all():
-        node = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
+    believable = np.abs(positions) <= FARTHEST  # a NaN is not
+    if not believable.all():
+        node = int(np.flatnonzero(~believable.all(axis=1))[0])
         raise ValueError(
-            f'surface of revision {revision}: node {node} is at {positions[node]}, which is not '
-            'finite: has the simulation diverged?'
+            f'surface of revision {revision}: node {node} is at {positions[node]} m, which is not '
+            f'finite or farther than {FARTHEST:g} m: has the simulation diverged?'
         )
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(positions)):
         raise ValueError(

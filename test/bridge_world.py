@@ -129,8 +129,8 @@ class World:
             assert time.monotonic() < end, f'no {state}: {self.record.states}'
             time.sleep(0.01)
 
-    def wait_until(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 5.0
+    def wait_until(self, condition: Callable[[], bool], timeout: float = 5.0) -> None:
+        deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, 'waited in vain'
             time.sleep(0.01)
@@ -181,7 +181,7 @@ class World:
         return response
 
     def _full_mesh(self) -> messages.Mesh:
-        return messages.Mesh(
+        mesh = messages.Mesh(
             revision=self.revision,
             topology=1,
             rest=POSITIONS.ravel().tolist(),
@@ -190,6 +190,9 @@ class World:
             triangles=TRIANGLES.ravel().tolist(),
             triangle_kind=[0] * len(TRIANGLES),
         )
+        mesh.header.frame_id = ros.FRAME
+        mesh.header.stamp = self.node.get_clock().now().to_msg()
+        return mesh
 
     def next_delta(self) -> messages.MeshDelta:
         """A surface that stays where it is."""
@@ -203,6 +206,7 @@ class World:
             displacement=[0.0] * POSITIONS.size,
         )
         delta.header.stamp = self.node.get_clock().now().to_msg()
+        delta.header.frame_id = ros.FRAME
         return delta
 
     def next_force(self) -> bytes:

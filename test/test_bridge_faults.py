@@ -14,7 +14,7 @@ import pytest
 from bridge_world import DEPTH, PRESSED, SCHEDULING, K, Record, World, session
 
 from haptic_bridge.settings import DeviceSettings
-from haptic_bridge.wire import PoseStampedCodec
+from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
 from tissue_sim import ros
 
 pytestmark = pytest.mark.real_time
@@ -40,11 +40,23 @@ POSES = {
     'jump': 'jumped',
     'clock ahead': r'stamps of arm/measured_cp jumped by \+',
     'clock back': 'stamps of arm/measured_cp jumped by -',
+    'another frame': "frame_id of arm/measured_cp changed from 'arm_base' to 'camera'",
+    'nan resistance': 'resistance is nan',
+    'force in another frame': "tissue/force has the frame_id 'arm_base'",
+    'nan surface': 'not finite',
+    'endless surface': 'node_count is 4000000000',
+    'device disabled': 'the device says that it is DISABLED',
     'two publishers': 'measured_cp has more than one publisher',
     'two simulations': 'tissue/force has more than one publisher',
 }
 """Faults of messages that end in FAULT, and what is said of them."""
+SPOILT = {
+    'nan resistance': (ros.FRAME, float('nan')),
+    'force in another frame': ('arm_base', 0.0),
+}
 TWO = ('two publishers', 'two simulations')
+SLOW = (*TWO, 'device disabled')
+"""What takes turns, or a new subscription, to be seen."""
 
 
 class FaultyWorld(World):
@@ -65,6 +77,9 @@ class FaultyWorld(World):
         elif self.fault == 'jump':
             values = (1.0, 0.0, self.height, 0.0, 0.0, 0.0, 1.0)
             data = PoseStampedCodec('arm_base').encode(now, values)
+        elif self.fault == 'another frame':
+            values = (*self.place, self.height, 0.0, 0.0, 0.0, 1.0)
+            data = PoseStampedCodec('camera').encode(now, values)
         ends = [self.pose]
         if self.fault == 'two publishers':
             # In turns, so that each of them has the last word every other time.
@@ -91,7 +106,13 @@ class FaultyWorld(World):
         elif self.fault == 'hole mended':
             delta.topology, delta.triangles_changed = 3, [0, 1]
             delta.triangles, delta.triangle_kind = [0, 1, 2, 0, 2, 3], [0, 0]
+        elif self.fault == 'nan surface':
+            delta.displacement[4] = float('nan')
+        elif self.fault == 'endless surface':
+            delta.node_count = 4_000_000_000
         force = self.next_force()
+        if self.fault in SPOILT:
+            force = self.spoilt_force(*SPOILT[self.fault])
         if self.fault == 'two simulations' and self.revision % 2:
             self.updates.publish(delta)
             self.second.publish(force)
@@ -99,6 +120,12 @@ class FaultyWorld(World):
         for _ in range(2 if self.fault == 'duplicated' else 1):
             self.updates.publish(delta)
             self.force.publish(force)
+
+    def spoilt_force(self, frame: str, resistance: float) -> bytes:
+        sample = ForceSampleCodec().decode(self.next_force())
+        values = list(sample.values)
+        values[ForceSampleCodec.fields['resistance'].start] = resistance
+        return ForceSampleCodec(frame).encode(sample.stamp_ns, values)
 
     def press(self) -> None:
         """Presses from above, and waits until the hand feels the tissue steadily."""
@@ -133,7 +160,7 @@ def play(world: FaultyWorld, record: Record) -> None:
         record.marks[f'{fault} over'] = time.time_ns()
 
     world.wait_for('ENABLED', 60.0)
-    for fault in ('nan', 'jump'):
+    for fault in ('nan', 'jump', 'another frame', *SPOILT, 'nan surface', 'endless surface'):
         begin(fault)
         world.wait_for('FAULT', 2.0)
         time.sleep(0.3)
@@ -147,6 +174,18 @@ def play(world: FaultyWorld, record: Record) -> None:
         time.sleep(0.3)
         world.lift()
         end(fault)
+    begin('device disabled')
+    device = world.node.create_publisher(world.state.msg_type, 'arm/operating_state', ros.LATCHED)
+    device.publish(world.state.msg_type(state='DISABLED', is_homed=True))
+    world.wait_for('FAULT', 2.0)
+    time.sleep(0.2)
+    world.command.publish(world.message(string='enable'))
+    time.sleep(0.2)
+    record.marks['device disabled refused'] = record.states[-1][1] == 'FAULT'
+    world.lift()
+    device.publish(world.state.msg_type(state='ENABLED', is_homed=True))
+    time.sleep(0.2)
+    end('device disabled')
     for fault, publisher in zip(TWO, (world.pose, world.force), strict=True):
         world.press()
         world.second = world.node.create_publisher(publisher.msg_type, publisher.topic, ros.STREAM)
@@ -229,12 +268,12 @@ def test_a_fault_is_zero_force_until_a_command_and_is_said(record, fault):
     after = [w.values[2] for w in record.wrenches if entered + SCHEDULING * 1e9 < w.stamp_ns < over]
     assert len(after) > 50
     assert not np.any(after)
-    assert (entered - began) / 1e9 < (1.5 if fault in TWO else 0.1 + SCHEDULING)
+    assert (entered - began) / 1e9 < (1.5 if fault in SLOW else 0.1 + SCHEDULING)
     assert any(re.search(POSES[fault], sentence) for sentence in record.said)
 
 
-@pytest.mark.parametrize('fault', TWO)
-def test_enable_is_refused_while_two_publish(record, fault):
+@pytest.mark.parametrize('fault', [*TWO, 'device disabled'])
+def test_enable_is_refused_while_the_cause_is_there(record, fault):
     assert record.marks[f'{fault} refused']
 
 

@@ -46,14 +46,6 @@ def test_every_pose_fault_has_a_sentence():
     assert set(safety.POSE_FAULTS) == set(codes)
 
 
-def test_a_tissue_force_that_is_none_or_absurd_is_refused():
-    stiffness = np.eye(3)
-    assert safety.force_gate(vector(0, 0, 1), stiffness)
-    assert not safety.force_gate(vector(0, np.nan, 1), stiffness)
-    assert not safety.force_gate(vector(0, 0, 2 * safety.LARGEST_FORCE), stiffness)
-    assert not safety.force_gate(vector(0, 0, 1), np.full((3, 3), np.inf))
-
-
 def test_no_force_passes_the_state_gate_unless_enabled():
     force = vector(1, 2, 3)
     safety.state_gate(True, force)

@@ -130,6 +130,7 @@ class MeshReplica:
         rest_at = _slots(delta.rest_changed, n, 'rest_changed')
         tets_at = _slots(delta.tetrahedra_changed, m, 'tetrahedra_changed')
         tris_at = _slots(delta.triangles_changed, k, 'triangles_changed')
+        self._require_growth(n, rest_at, m, tets_at, k, tris_at)
         moved_at = np.arange(n) if everything else _slots(delta.displaced, n, 'displaced')
         tets = _indices(delta.tetrahedra, 4, n, 'tetrahedra')
         tris = _indices(delta.triangles, 3, n, 'triangles')
@@ -153,6 +154,21 @@ class MeshReplica:
         self._displacement[moved_at] = np.array(delta.displacement, float).reshape(-1, 3)
         self.revision, self.topology, self.step = delta.revision, delta.topology, delta.step
         return True
+
+    def _require_growth(
+        self, n: int, nodes: np.ndarray, m: int, tets: np.ndarray, k: int, triangles: np.ndarray
+    ) -> None:
+        """Refuses counts that are larger than what is known and what the delta's slots give."""
+        for name, count, known, given in (
+            ('node', n, self._nodes, nodes),
+            ('tetrahedron', m, self._tets, tets),
+            ('triangle', k, self._tris, triangles),
+        ):
+            if count > known + len(given):
+                raise ValueError(
+                    f'mesh delta field {name}_count is {count}, but there are {known} and the '
+                    f'delta gives {len(given)} slots'
+                )
 
     def _resize(self, n: int, m: int, k: int) -> None:
         self._rest = grown(self._rest, n)

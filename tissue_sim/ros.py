@@ -175,7 +175,7 @@ def run(make_node: Callable[[], Node], work: Callable[[Any, Stop], None] | None 
         raise SystemExit(2) from None
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    spinner = threading.Thread(target=_spin, args=(executor, stop), daemon=True)
+    spinner = threading.Thread(target=_spin, args=(executor, node, stop), daemon=True)
     spinner.start()
     try:
         if work is None:
@@ -191,9 +191,13 @@ def run(make_node: Callable[[], Node], work: Callable[[Any, Stop], None] | None 
         rclpy.shutdown()
 
 
-def _spin(executor: SingleThreadedExecutor, stop: Stop) -> None:
+def _spin(executor: SingleThreadedExecutor, node: Node, stop: Stop) -> None:
     while not stop.is_set():
         try:
             executor.spin_once(timeout_sec=0.1)
         except ExternalShutdownException:
             return
+        except Exception as error:
+            # Bytes of another type than the topic's, say: no reason to be deaf from then on.
+            said = f'a callback failed: {type(error).__name__}: {error}'
+            node.get_logger().error(said, throttle_duration_sec=1.0)
