@@ -184,6 +184,14 @@ def test_a_message_that_is_late_or_invalid_is_no_jump_of_the_clock():
     assert not watch.see(4, 3 * SECOND, 3 * SECOND)
 
 
+def test_a_frame_that_changes_is_told_and_its_new_name_is_taken():
+    watch = StreamWatch('cp')
+    frames = ['base', 'base', 'camera', 'camera']
+    said = [watch.see(n, 0, n, frame) for n, frame in enumerate(frames, 1)]
+    assert [n for n, sentence in enumerate(said) if sentence] == [2]
+    assert "from 'base' to 'camera'" in said[2]
+
+
 class FakeNode:
     def create_subscription(self, _kind, topic, callback, _qos):
         self.topic, self.press = topic, callback

@@ -4,7 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from haptic_bridge.operating_state import COMMANDS, OperatingStateMachine, State, crtk_types
+from haptic_bridge.operating_state import (
+    COMMANDS,
+    OperatingStateMachine,
+    State,
+    crtk_types,
+    device_cause,
+)
 
 D, E, P, F = State.DISABLED, State.ENABLED, State.PAUSED, State.FAULT
 INVALID = True
@@ -115,3 +121,10 @@ def test_messages_have_the_fields_of_crtk():
     assert list(state) == ['header', 'state', 'is_homed', 'is_busy']
     assert list(types.command.get_fields_and_field_types()) == ['header', 'string']
     assert list(types.query.Response.get_fields_and_field_types()) == ['operating_state']
+
+
+@pytest.mark.parametrize('state', ['DISABLED', 'PAUSED', 'FAULT', 'UNDEFINED', ''])
+def test_a_device_in_any_state_but_enabled_or_not_homed_is_a_cause(state):
+    assert device_cause('ENABLED', is_homed=True) == ''
+    assert 'not homed' in device_cause('ENABLED', is_homed=False)
+    assert 'not ENABLED' in device_cause(state, is_homed=True)
