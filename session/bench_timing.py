@@ -26,6 +26,7 @@ from session.processes import Supervisor
 from session.progress import SessionProgress
 from session.scene import load_scene
 from session.status import Status
+from tissue_sim.timing import TIMELY
 
 SETTLING = 2.0
 """[s] after the first message that are not counted: the nodes are still starting."""
@@ -43,6 +44,7 @@ class Row:
         p50, p999: medians over the seconds of that second's quantile.
         worst_p999: the worst second's.
         largest: of all.
+        timely: share of deadlines that were met within 0.5 ms; None where there is no deadline.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Row:
     p999: float
     worst_p999: float
     largest: float
+    timely: float | None = None
 
 
 def run_bench(
@@ -70,11 +73,11 @@ def run_bench(
             SessionProgress(notes, len(nodes)) as progress,
             Supervisor(nodes, bag / 'log', environment, progress.tell) as supervisor,
         ):
-            reference = None
+            references = []
             if supervisor.start():
-                reference = _start_reference(seconds, environment)
+                references = _start_references(seconds, environment)
                 supervisor.run(seconds, tick=lambda elapsed: progress.tick(elapsed, seconds))
-            bare = _finish_reference(reference)
+            bare = [row for process in references for row in _finish_reference(process)]
             outcome = supervisor.end()
         if not outcome.ran or outcome.deaths:
             notes.print(f'[bold red]error:[/] {outcome.unready or outcome.deaths}')
@@ -106,7 +109,8 @@ def measured(statuses: Iterable[NodeStatus]) -> list[Row]:
         if p50 and tail:
             label = name if _numbers(of_node, f'{key}_p999') else f'{name} (p99)'
             median = statistics.median
-            rows.append(Row(label, median(p50), median(tail), max(tail), max(largest)))
+            timely = statistics.mean(_numbers(of_node, 'timely')) if key == 'lateness' else None
+            rows.append(Row(label, median(p50), median(tail), max(tail), max(largest), timely))
     return rows
 
 
@@ -115,26 +119,27 @@ def _numbers(statuses: list[NodeStatus], key: str) -> list[float]:
     return [value for value in values if not np.isnan(value)]
 
 
-def _start_reference(seconds: float, environment: dict[str, str]) -> 'subprocess.Popen[str]':
+def _start_references(seconds: float, environment: dict[str, str]) -> list['subprocess.Popen[str]']:
+    """A loop that does nothing but wake, in Python, and cyclictest's in C where it is installed."""
+    commands = [[sys.executable, '-m', 'session.reference_loop', str(seconds)]]
     cyclictest = shutil.which('cyclictest')
     if cyclictest is not None:
         options = f'-q -m -t 1 -p {PRIORITY} -i 1000 -h 50000 -D {round(seconds)}'
-        command = [cyclictest, *options.split()]
-    else:
-        command = [sys.executable, '-m', 'session.reference_loop', str(seconds)]
-    return subprocess.Popen(
-        command,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
+        commands.insert(0, [cyclictest, *options.split()])
+    return [
+        subprocess.Popen(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        for command in commands
+    ]
 
 
-def _finish_reference(process: 'subprocess.Popen[str] | None') -> list[Row]:
-    if process is None:
-        return []
+def _finish_reference(process: 'subprocess.Popen[str]') -> list[Row]:
     try:
         said, _ = process.communicate(timeout=20.0)
     except subprocess.TimeoutExpired:
@@ -146,8 +151,8 @@ def _finish_reference(process: 'subprocess.Popen[str] | None') -> list[Row]:
         return [cyclictest_row(said)]
     report = json.loads(said)
     p999 = report['lateness_p999']
-    name = 'bare Python loop (no cyclictest)'
-    return [Row(name, report['lateness_p50'], p999, p999, report['lateness_max'])]
+    largest, timely = report['lateness_max'], report['timely']
+    return [Row('bare Python loop', report['lateness_p50'], p999, p999, largest, timely)]
 
 
 def cyclictest_row(said: str) -> Row:
@@ -163,7 +168,9 @@ def cyclictest_row(said: str) -> Row:
         for share in (0.5, 0.999)
     )
     maximum = _MAXIMUM.search(said)
-    return Row('cyclictest', p50, p999, p999, int(maximum[1]) * 1e-6 if maximum else p999)
+    largest = int(maximum[1]) * 1e-6 if maximum else p999
+    timely = float(counts[latencies <= TIMELY].sum() / total)
+    return Row('cyclictest', p50, p999, p999, largest, timely)
 
 
 def _show(rows: list[Row], *, as_json: bool) -> None:
@@ -173,9 +180,11 @@ def _show(rows: list[Row], *, as_json: bool) -> None:
         return
     table = Table(title='Times [ms]', box=box.SIMPLE_HEAD)
     table.add_column('')
-    for column in ('median', 'p99.9', 'p99.9 of the\nworst second', 'largest'):
+    headings = ('median', 'p99.9', 'p99.9 of the\nworst second', 'largest', 'within 0.5 ms\n[%]')
+    for column in headings:
         table.add_column(column, justify='right')
     for row in rows:
         values = (row.p50, row.p999, row.worst_p999, row.largest)
-        table.add_row(row.name, *(f'{1e3 * value:.3f}' for value in values))
+        timely = f'{100 * row.timely:.2f}' if row.timely is not None else ''
+        table.add_row(row.name, *(f'{1e3 * value:.3f}' for value in values), timely)
     console.print(table)

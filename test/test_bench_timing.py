@@ -3,13 +3,14 @@
 import json
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 
 from session.bench_timing import cyclictest_row, measured
 from session.evidence import Status
-from tissue_sim.timing import Durations
+from tissue_sim.timing import TIMELY, Durations, PeriodicLoop
 
 CYCLICTEST = """\
 # /dev/cpu_dma_latency set to 0us
@@ -23,12 +24,17 @@ CYCLICTEST = """\
 # Avg Latencies: 00004
 # Max Latencies: 70000
 # Histogram Overflows: 00001
+# Histogram Overflow at cycle number:
+# Thread 0: 00517
+
 """
+"""As cyclictest 2.4 prints it with -q -h."""
 
 
 def test_quantiles_of_cyclictest_are_those_of_its_histogram_with_what_overflowed():
     row = cyclictest_row(CYCLICTEST)
     assert (row.p50, row.p999, row.largest) == pytest.approx((3e-6, 120e-6, 0.07))
+    assert row.timely == pytest.approx(0.999)
     assert cyclictest_row(CYCLICTEST.replace('00001\n', '00100\n')).p999 == np.inf
 
 
@@ -42,12 +48,27 @@ def test_a_run_is_the_median_of_its_seconds_and_its_worst_second():
             {
                 f'lateness_{key}': str(v * scale)
                 for key, scale in (('p50', 1), ('p999', 5), ('max', 9))
-            },
+            }
+            | {'timely': str(1 - v / 100)},
         )
         for time, v in ((1.0, 99.0), (3.0, 2.0), (4.0, 3.0), (5.0, 8.0))
     ]
     (row,) = measured(statuses)
     assert (row.p50, row.p999, row.worst_p999, row.largest) == (3, 15, 40, 72)
+    assert row.timely == pytest.approx(1 - 0.13 / 3)
+
+
+def test_deadlines_that_a_loop_slept_through_were_not_met():
+    loop = PeriodicLoop(200.0)
+    loop.start()
+    late = []
+    for tick in range(20):
+        late.append(loop.wait())
+        if tick == 10:
+            time.sleep(0.05)
+    assert loop.missed >= 9
+    timely = sum(ns <= TIMELY * 1e9 for ns in late) / (20 + loop.missed)
+    assert loop.report()['timely'] == pytest.approx(timely)
 
 
 def test_durations_are_reported_once():

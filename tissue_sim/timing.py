@@ -6,6 +6,8 @@ import time
 import numpy as np
 
 NANOSECONDS = 1_000_000_000
+TIMELY = 0.0005
+"""[s] after its deadline by which a tick is timely."""
 
 
 class PeriodicLoop:
@@ -26,7 +28,7 @@ class PeriodicLoop:
         self._starts = np.zeros(window, np.int64)
         self._lateness = np.zeros(window, np.int64)
         self._busy = np.zeros(window, np.int64)
-        self._reported = 0
+        self._reported = self._reported_missed = 0
         self._deadline = 0
         self._woken = 0
 
@@ -63,11 +65,13 @@ class PeriodicLoop:
         Returns:
             rate [Hz], period_p50, period_p99, period_max [s], lateness_p50, lateness_p99,
             lateness_p999, lateness_max [s], busy_p50, busy_p99, busy_max [s] (work between two
-            sleeps), within (share of periods within half a period of the nominal one), ticks and
+            sleeps), within (share of periods within half a period of the nominal one), timely
+            (share of deadlines that were met within `TIMELY`; a missed one was not), ticks and
             missed (totals).
         """
         count = min(self.ticks - self._reported, len(self._starts))
-        self._reported = self.ticks
+        missed = self.missed - self._reported_missed
+        self._reported, self._reported_missed = self.ticks, self.missed
         totals = {'ticks': float(self.ticks), 'missed': float(self.missed)}
         if count < 3:
             return totals
@@ -78,6 +82,7 @@ class PeriodicLoop:
         nominal = self.period_ns / NANOSECONDS
         return totals | {
             'rate': float(1 / periods.mean()),
+            'timely': float(np.sum(lateness <= TIMELY) / (count + missed)),
             'within': float(np.mean(np.abs(periods - nominal) <= nominal / 2)),
             **_quantiles('period', periods, (50, 99)),
             **_quantiles('lateness', lateness, (50, 99, 99.9)),

@@ -1,0 +1,81 @@
+"""Claims about force loop and tissue in one process, in a time of its own."""
+
+import numpy as np
+import pytest
+from meshes import irregular_box
+
+from haptic_bridge.force_path import ForcePath
+from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from session.errors import SessionError
+from session.haptics_accuracy import run_accuracy
+from session.haptics_stability import run_stability
+from session.in_process import InProcess, LinkSettings, Tissue
+from tissue_sim.blade import Resistance
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh
+from tissue_sim.simulation import TissueSimulation
+
+RADIUS, TOP = 0.004, 0.012
+RATE = 50.0
+FRAME = 20
+"""Ticks of a frame."""
+
+
+def session(link: LinkSettings | None = None) -> InProcess:
+    """A small soft block under a tool."""
+    nodes, tetrahedra = irregular_box((4, 4, 3), 0.004, 1, jitter=0.1)
+    simulation = TissueSimulation(
+        TetMesh(nodes, tetrahedra, nodes[:, 2] < 1e-6),
+        Material(3000.0, 0.45, 1060.0, 10.0, 5e-4),
+        Resistance(100.0, 80.0, 10.0),
+    )
+    tool, device, haptics = ToolSettings(radius=RADIUS), DeviceSettings(), HapticsSettings()
+    path = ForcePath(tool, device, haptics, device.load_profile())
+    return InProcess(path, Tissue(simulation), RATE, link)
+
+
+def pressed(link: LinkSettings | None = None, ticks: int = 700) -> tuple[InProcess, np.ndarray]:
+    """Forces [N] by tick of a press 3 mm deep, shape (ticks, 3)."""
+    loop = session(link)
+    depth = np.interp(np.arange(ticks), [0, 200, ticks], [-2e-3, 3e-3, 3e-3])
+    tips = np.column_stack([np.full((ticks, 2), 0.008), TOP + RADIUS - depth])
+    return loop, np.array([loop.tick(tip).wrench[:3] for tip in tips])
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not():
+    runs = [pressed(LinkSettings(delay=0.02, loss=0.2, seed=s))[1] for s in (1, 1, 2)]
+    assert runs[0].any()
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert (runs[0] != runs[2]).any()
+
+
+def test_the_tissue_is_at_its_own_rate_and_answers_the_press():
+    loop, forces = pressed()
+    assert loop.ticks == 700
+    assert loop.frame is not None
+    assert loop.frame.step == 700 // FRAME
+    np.testing.assert_allclose(forces[-1], loop.frame.force, rtol=0.05, atol=5e-3)
+    assert forces[-1, 2] > 0.05
+
+
+def test_an_answer_that_never_comes_is_a_silent_simulation():
+    loop, forces = pressed(LinkSettings(loss=1.0))
+    assert loop.frame is not None
+    assert not forces.any()
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.05])
+def test_an_answer_takes_computing_and_the_way_there_and_back(delay):
+    loop = session(LinkSettings(delay=delay, compute=0.01))
+    ages = []
+    for _ in range(300):
+        loop.tick(np.array([0.0, 0.0, 0.1]))
+        ages.append(loop.path.simulation_age(10**9 + (loop.ticks - 1) * 10**6))
+    first = int(np.flatnonzero(np.isfinite(ages))[0])
+    assert first == pytest.approx(FRAME + 1000 * (0.01 + delay), abs=1)
+
+
+@pytest.mark.parametrize('command', [run_accuracy, run_stability])
+def test_a_folder_that_cannot_take_the_tables_is_refused_before_anything_runs(command, tmp_path):
+    with pytest.raises(SessionError, match='nowhere'):
+        command(tmp_path / 'nowhere')
