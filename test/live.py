@@ -22,7 +22,7 @@ from rclpy.node import Node
 from ruamel.yaml import YAML
 
 from bags.reader import Recorded, open_bag
-from haptic_bridge.settings import HapticsSettings
+from haptic_bridge.settings import DeviceSettings, HapticsSettings
 from haptic_bridge.wire import ForceSampleCodec, WrenchStampedCodec
 from session.domain import reserved_domain
 from session.graph import MODULES
@@ -36,6 +36,7 @@ ABOVE, PRESSED, EASED = 0.0190, 0.0110, 0.0125
 """Heights of the tip [m] over the block, of which the surface is at 10 mm and the radius 4 mm."""
 SPOT = (-0.012, -0.008)
 HAPTICS = HapticsSettings()
+PROFILE = DeviceSettings().load_profile()
 FRAME = 1 / 30
 """[s] between two frames of the tissue."""
 STEADY = 0.3
@@ -274,6 +275,16 @@ def held_up(recording: Recording, times: np.ndarray) -> np.ndarray:
         end = frames[gap + 1] + HAPTICS.soft_start + 2 * FRAME
         held |= (times > frames[gap] + HAPTICS.stale_after - FRAME) & (times < end)
     return held
+
+
+def require_limits(recording: 'Recording') -> None:
+    """Every commanded force is finite and within the device's norm and slew; or zero at once."""
+    times, forces = recording.read(SERVO_CF, WrenchStampedCodec(), 'force')
+    assert np.isfinite(forces).all()
+    assert np.linalg.norm(forces, axis=1).max() <= PROFILE.max_force
+    steps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
+    faster = steps > PROFILE.max_slew * np.clip(np.diff(times), 1e-4, 5e-3) + 1e-3
+    assert not forces[1:][faster].any()
 
 
 def deaths(said: str) -> list[str]:

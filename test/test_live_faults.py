@@ -28,6 +28,7 @@ from live import (
     deaths,
     free_domain,
     held_up,
+    require_limits,
     two_presses,
     wait_for,
     worst_gap,
@@ -37,8 +38,7 @@ from live import (
 from rosbags.highlevel import AnyReader
 
 from haptic_bridge.node import FOLLOW_PERIOD
-from haptic_bridge.settings import DeviceSettings
-from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec, WrenchStampedCodec
+from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
 from session.graph import MODULES, node_environment
 from session.status import Status
 
@@ -49,7 +49,6 @@ PRESSING = 0.25
 """[N] that says that the hand is down; at rest there it feels a little more."""
 TISSUE_DEADLINE, BRIDGE_DEADLINE = 0.150, 0.030
 FROZEN = 0.8
-PROFILE = DeviceSettings().load_profile()
 UNWRITTEN = 0.5
 """[s] of a bag that a killed recorder may take along."""
 SAME = 0.02
@@ -117,6 +116,7 @@ def kill(session: LiveSession) -> Kill:
         assert deaths(session.said) == [node]
         then()
         recording = Recording(folder)
+        require_limits(recording)
         fault = Fault(recording, recording.at(killed))
         times, norms = recording.force(SERVO_CF)
         before = (times < fault.killed) & ~held_up(recording, times)
@@ -206,17 +206,14 @@ def test_force_fades_and_comes_back_when_the_tissue_is_frozen_and_goes_on(
     assert session.end() in (Status.OK, Status.FAILED)  # its rate was not held
     assert deaths(session.said) == []
     recording = Recording(session.bag)
-    times, forces = recording.read(SERVO_CF, WrenchStampedCodec(), 'force')
-    norms = np.linalg.norm(forces, axis=1)
+    times, norms = recording.force(SERVO_CF)
     start, end = recording.at(stopped), recording.at(goes_on)
     delay = worst_gap(times, start - 0.1, end)
     silent = (times > start + TISSUE_DEADLINE + FOLLOW_PERIOD + delay) & (times < end)
     assert silent.sum() > 100
     assert not norms[silent].any()
     assert norms[times > end + 0.6].max() > PRESSING
-    assert norms.max() <= PROFILE.max_force
-    steps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
-    assert (steps <= PROFILE.max_slew * np.clip(np.diff(times), 1e-4, 5e-3) + 1e-3).all()
+    require_limits(recording)
     states = recording.messages('/haptic_bridge/operating_state')
     assert 'FAULT' not in [recording.bag.read(message).state for message in states]
     assert 'no frame of the simulation for 100 ms' in session.said
