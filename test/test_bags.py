@@ -5,7 +5,6 @@ import os
 import random
 import resource
 import sys
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,9 +12,9 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from independent_readers import by_rosbags
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bags.errors import BagError
@@ -98,17 +97,11 @@ def folder(tmp_path: Path, messages: list[Recorded]) -> Path:
     return folder
 
 
-def read_by_rosbags(folder: Path) -> list[tuple[str, str, int, bytes]]:
-    with warnings.catch_warnings(), AnyReader([folder]) as reader:
-        warnings.simplefilter('error')
-        return [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
-
-
 def test_an_independent_reader_gets_every_message_byte_for_byte(
     folder: Path, messages: list[Recorded]
 ) -> None:
     expected = [(m.topic, m.type, m.log_time, m.data) for m in messages]
-    assert read_by_rosbags(folder) == expected
+    assert by_rosbags(folder) == expected
 
 
 def test_our_reader_gets_all_that_was_written_in_the_order_of_log_times(

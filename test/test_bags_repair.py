@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_bags import add_topics, read_by_rosbags, some_messages, write_all
+from independent_readers import by_rosbags
+from test_bags import add_topics, some_messages, write_all
 
 from bags.errors import BagError
 from bags.metadata import read_metadata
@@ -55,7 +56,7 @@ def test_a_bag_cut_off_is_whole_again_with_its_complete_chunks_for_every_reader(
     assert bag.complete and bag.custom_data == {'seed': '7'}
     assert 200 < len(kept) == result.messages < 500
     assert kept == MESSAGES[: len(kept)]
-    assert read_by_rosbags(folder) == [(m.topic, m.type, m.log_time, m.data) for m in kept]
+    assert by_rosbags(folder) == [(m.topic, m.type, m.log_time, m.data) for m in kept]
     assert read_metadata(folder)['message_count'] == len(kept)
     assert result.cut_off > 0 and str(result.cut_off) in told(folder, result)[1]
     assert sorted(path.name for path in folder.iterdir()) == ['metadata.yaml', 'session_0.mcap']

@@ -213,7 +213,7 @@ def test_evidence_is_what_was_written_into_the_bag(tmp_path: Path) -> None:
     writer = BagWriter(tmp_path / 'bag', custom_data={})
     qos = (OfferedQos(depth=1, reliability='reliable', durability='volatile'),)
     for topic, name in (('/tool/contact', 'Contact'), ('/arm/servo_cf', 'WrenchStamped')):
-        writer.add_topic(topic, f'some_msgs/msg/{name}', '', 'RIHS01_0', qos)
+        writer.add_topic(topic, f'some_msgs/msg/{name}', '', '', qos)
     second = 1_000_000_000
     for number in (1, 2, 5):
         time = second + number * second // 10
@@ -235,7 +235,7 @@ def test_evidence_is_what_was_written_into_the_bag(tmp_path: Path) -> None:
 
 def test_what_a_late_node_said_unheard_is_no_loss_of_the_others(tmp_path: Path) -> None:
     writer = BagWriter(tmp_path / 'bag', custom_data={})
-    writer.add_topic('/parameter_events', 'some_msgs/msg/Event', '', 'RIHS01_0', (OfferedQos(),))
+    writer.add_topic('/parameter_events', 'some_msgs/msg/Event', '', '', (OfferedQos(),))
     for time, number in enumerate((1, 2, 3, 7, 4, 8), start=1):
         writer.write('/parameter_events', time, time, b'', number)
     writer.close()
