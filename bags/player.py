@@ -1,6 +1,10 @@
 """What is to be published when a bag is played; no ROS and no clock of its own."""
 
+import queue
+import threading
 from collections.abc import Collection, Iterator
+from contextlib import suppress
+from itertools import islice
 
 import numpy as np
 
@@ -65,8 +69,55 @@ class Playhead:
         self._position += STEP
 
 
+_BATCH, _BATCHES = 500, 4
+"""Messages that are read before they are due: 0.3 s of a session or more."""
+
+
+class ReadAhead:
+    """Reads messages in a thread of its own before they are due; use `close` in the end.
+
+    A chunk of a bag takes some 20 ms to unpack: longer than a loop of 1 kHz can wait.
+
+    Args:
+        source: of the messages.
+    """
+
+    def __init__(self, source: Iterator[Recorded]) -> None:
+        self._source = source
+        self._batches: queue.Queue[list[Recorded]] = queue.Queue(_BATCHES)
+        self._closed = threading.Event()
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[Recorded]:
+        while batch := self._batches.get():
+            yield from batch
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        """Reads no more."""
+        self._closed.set()
+        self._thread.join()
+
+    def _read(self) -> None:
+        try:
+            while batch := list(islice(self._source, _BATCH)):
+                self._put(batch)
+        except Exception as error:  # whatever a damaged bag makes a parser say
+            self._failure = error
+        self._put([])
+
+    def _put(self, batch: list[Recorded]) -> None:
+        while not self._closed.is_set():
+            with suppress(queue.Full):
+                self._batches.put(batch, timeout=0.1)
+                return
+
+
 class RecordedStream:
-    """The recorded messages in their order, for as long as a playhead goes forward.
+    """The recorded messages in their order, for as long as a playhead goes forward; `close` it.
 
     Deltas of the mesh are left out until a keyframe has come: whoever listens could not apply them.
 
@@ -79,7 +130,8 @@ class RecordedStream:
     def __init__(self, bag: Bag, topics: Collection[str], start: float) -> None:
         self._origin = first_time(bag)
         since = self._origin + round(start * 1e9)
-        self._messages = bag.messages(topics, since=since if start else 0)
+        self._ahead = ReadAhead(bag.messages(topics, since=since if start else 0))
+        self._messages = iter(self._ahead)
         self._next = next(self._messages, None)
         self._has_mesh = False
 
@@ -91,6 +143,10 @@ class RecordedStream:
             self._has_mesh |= message.topic == MESH
             if self._has_mesh or message.topic != UPDATES:
                 yield message
+
+    def close(self) -> None:
+        """Reads no more."""
+        self._ahead.close()
 
 
 class RecordedHand:
@@ -124,12 +180,11 @@ class RecordedHand:
 
 def first_time(bag: Bag) -> int:
     """Log time of the first message [ns since the epoch]."""
-    for message in bag.messages():
-        return message.log_time
-    raise BagError(f'{bag.path} has no message')
+    if not bag.span[0]:
+        raise BagError(f'{bag.path} has no message')
+    return bag.span[0]
 
 
 def duration(bag: Bag) -> float:
     """From the first message to the last [s]."""
-    last = max(message.log_time for message in bag.messages())
-    return (last - first_time(bag)) * 1e-9
+    return (bag.span[1] - first_time(bag)) * 1e-9

@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.context import Context
@@ -47,15 +48,18 @@ class Player(Node):
 
     Attributes:
         refusal: why the replay was stopped, '' while it may go on.
+        faulted: where in the session [s] the haptic bridge came to a FAULT; None: it did not.
     """
 
     def __init__(self, context: Context, playhead: Playhead) -> None:
         super().__init__('player', context=context)
         self.playhead = playhead
         self.refusal = ''
+        self.faulted: float | None = None
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self)
         self._stop = threading.Event()
+        self._before: Callable[[], object] = lambda: None
         self._threads = [
             threading.Thread(target=self._play, daemon=True),
             threading.Thread(target=self._serve, daemon=True),
@@ -67,8 +71,13 @@ class Player(Node):
         time.sleep(_DISCOVERY)
         self._look(topics, 0)
 
-    def start(self) -> None:
-        """Starts to play."""
+    def start(self, before: Callable[[], object] = lambda: None) -> None:
+        """Starts to play.
+
+        Args:
+            before: is called in the thread that plays, before it does.
+        """
+        self._before = before
         for thread in self._threads:
             thread.start()
 
@@ -103,10 +112,14 @@ class Player(Node):
 
     def _play(self) -> None:
         loop = PeriodicLoop(_RATE)
+        self._before()
         loop.start()
-        while not self._stop.is_set() and not self.refusal:
-            loop.wait()
-            self.play(self.playhead.move(time.monotonic()))
+        try:
+            while not self._stop.is_set() and not self.refusal:
+                loop.wait()
+                self.play(self.playhead.move(time.monotonic()))
+        except Exception as error:  # whatever a damaged bag makes a parser say
+            self.refusal = f'the bag cannot be played further: {error}'
 
     def _serve(self) -> None:
         due = 0.0
@@ -154,6 +167,7 @@ class SessionPlayer(Player):
     def play(self, position: float) -> None:
         if self.playhead.rounds != self._rounds:
             self._rounds = self.playhead.rounds
+            self._stream.close()
             self._stream = RecordedStream(self._bag, self.topics, self._start)
         for message in self._stream.due(position):
             data = message.data
@@ -163,6 +177,7 @@ class SessionPlayer(Player):
             self._publishers_by_topic[message.topic].publish(data)
 
     def finish(self) -> None:
+        self._stream.close()
         if SERVO_CF in self.topics and hasattr(self, '_publishers_by_topic'):
             zero = self._wrench.encode(time.time_ns(), (0.0,) * 6)
             self._publishers_by_topic[SERVO_CF].publish(zero)
@@ -172,6 +187,7 @@ class HandPlayer(Player):
     """Is the device of a session: publishes its recorded poses anew, a thousand times a second.
 
     It waits at the first pose until the haptic bridge is enabled; a pause holds the hand still.
+    When the bridge comes to a FAULT the hand stays where it is.
 
     Args:
         context: of the domain to play into.
@@ -197,7 +213,9 @@ class HandPlayer(Player):
         values = self._hand.pose(position).values
         self._poses.publish(self._codec.encode(time.time_ns(), values))
 
-    def _heard(self, message: object) -> None:
-        if not self._enabled and getattr(message, 'state', '') == State.ENABLED:
+    def _heard(self, message: Any) -> None:
+        if not self._enabled and message.state == State.ENABLED:
             self._enabled = True
             self.playhead.toggle()
+        elif self._enabled and self.faulted is None and message.state == State.FAULT:
+            self.faulted = self.playhead.position

@@ -53,6 +53,7 @@ class Bag:
             and the complete chunks are what is read.
         custom_data: as the recorder wrote it: scene, seed, versions.
         schemas: definition text by type.
+        span: smallest and largest log time [ns since the epoch], zeros where there is no message.
     """
 
     def __init__(self, path: Path, custom_data: dict[str, str]) -> None:
@@ -62,10 +63,11 @@ class Bag:
         self._profiles: dict[str, str] = {}
         self.schemas: dict[str, str] = {}
         self._decoder = Decoder(self.schemas)
+        self.span = (0, 0)
         self.complete = self._read_summary()
         if not self.complete:
-            for _ in self._salvage():
-                pass
+            times = [message.log_time for _, _, message in self._salvage()]
+            self.span = (min(times), max(times)) if times else (0, 0)
 
     def topics(self) -> dict[str, str]:
         """Type by topic."""
@@ -127,6 +129,9 @@ class Bag:
             return False
         for channel in summary.channels.values():
             self._know(summary.schemas[channel.schema_id], channel)
+        if summary.statistics is not None:
+            counted = summary.statistics
+            self.span = (counted.message_start_time, counted.message_end_time)
         return True
 
     def _indexed(

@@ -18,6 +18,7 @@ from bags.player import Playhead, RecordedHand, duration
 from bags.player_node import HandPlayer, Player, SessionPlayer
 from bags.reader import Bag, open_bag
 from bags.topics import OF_TISSUE, POSE, REPLAYED, SERVO_CF
+from haptic_bridge.realtime import prepare
 from session.demo import new_bag
 from session.domain import reserved_domain
 from session.errors import SessionError
@@ -101,7 +102,7 @@ def _show(options: ReplayOptions, bag: Bag, context: Context, end: float) -> Sta
             player.advertise()
             time.sleep(1.0)  # subscribers that are there already hear the first message
             playhead.toggle()
-            player.start()
+            player.start(prepare)
             while True:
                 time.sleep(_POLL)
                 screen.tick(player)
@@ -131,8 +132,8 @@ def _drive(options: ReplayOptions, bag: Bag, context: Context, domain: int) -> S
                 player.refuse_live_input([*OF_TISSUE, SERVO_CF, f'{REPLAYED}{POSE}'])
                 _check(player)
                 player.advertise()
-                player.start()
                 if supervisor.start():
+                    player.start(prepare)  # now: a process takes over the priority of its parent
                     supervisor.run(_FOREVER, tick=lambda _: screen.tick(player))
             except _Over:
                 pass
@@ -143,6 +144,9 @@ def _drive(options: ReplayOptions, bag: Bag, context: Context, domain: int) -> S
         raise SessionError(outcome.unready)
     if outcome.deaths:
         return Status.NODE_DIED
+    if player.faulted is not None:
+        screen.say(f'the haptic bridge came to a FAULT at {player.faulted:.2f} s: no force after')
+        return Status.FAILED
     return Status.INTERRUPTED if outcome.interrupted else Status.OK
 
 
@@ -206,7 +210,11 @@ class _Screen:
         """Shows what a node does."""
         if event.kind != 'ending':
             text = event.text if event.kind != 'warning' else f'{event.node}: {event.text}'
-            self._console.print(escape(text), highlight=False)
+            self.say(text)
+
+    def say(self, text: str) -> None:
+        """Shows a line that stays."""
+        self._console.print(escape(text), highlight=False)
 
     def tick(self, player: Player) -> None:
         """Obeys the keys and shows where the replay is.
@@ -216,6 +224,8 @@ class _Screen:
             SessionError: it has to stop.
         """
         _check(player)
+        if player.faulted is not None:
+            raise _Over
         act_on(self._keys.pressed(), self._playhead)
         position = self._playhead.position
         self._bar.update(
