@@ -115,8 +115,12 @@ def to_yaml(information: Mapping[str, Any]) -> str:
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """Writes metadata.yaml so that at any moment the whole old or the whole new one is there."""
     temporary = folder / f'{METADATA_FILE}.tmp'
-    temporary.write_text(to_yaml({_ROOT: dict(information)}), encoding='utf-8')
-    temporary.replace(folder / METADATA_FILE)
+    try:
+        temporary.write_text(to_yaml({_ROOT: dict(information)}), encoding='utf-8')
+        temporary.replace(folder / METADATA_FILE)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:

@@ -148,6 +148,13 @@ class Recorder(Node):
                     f'{", ".join(weaker)} came later and offers a weaker QoS than those before',
                 )
 
+    def flush(self) -> None:
+        """Hands what has come to the operating system; says at once when that refuses it."""
+        well = not self.writer.failure
+        self.writer.flush()
+        if well and self.writer.failure:
+            self.get_logger().error(f'{self.writer.failure}: nothing is recorded from now on')
+
     def drain(self) -> None:
         """Takes all that has come and gives it to the writer in the order of arrival."""
         batch = []
@@ -182,7 +189,9 @@ class Recorder(Node):
         for topic, reason in self._unrecorded.items():
             print(f'  not recorded: {topic}: {reason}', flush=True)
         if self.writer.failure:
-            print(f'  {self.writer.failure}', flush=True)
+            lost = sum(self.writer.lost.values())
+            text = f'{self.writer.failure}: {lost} messages are not in the bag'
+            print(f'failed: {self.get_name()}: {text}', flush=True)
 
     def accounts(self) -> dict[str, Account]:
         """What became of the messages of each topic so far."""
@@ -241,8 +250,8 @@ def record(node: Recorder, stop: Stop) -> None:
     """Records until `stop` is set."""
     node.discover()
     announce_ready(node)
-    due = dict.fromkeys((node.discover, node.review, node.writer.flush), 0.0)
-    periods = {node.discover: _DISCOVER, node.review: _REVIEW, node.writer.flush: _FLUSH}
+    periods = {node.discover: _DISCOVER, node.review: _REVIEW, node.flush: _FLUSH}
+    due = dict.fromkeys(periods, 0.0)
     while not stop.is_set():
         time.sleep(_POLL)
         node.drain()
@@ -254,8 +263,9 @@ def record(node: Recorder, stop: Stop) -> None:
 
 
 def main() -> None:
-    """Runs the node."""
-    run(Recorder, record)
+    """Runs the node; exit status 1 where the disk has refused messages."""
+    recorder = run(Recorder, record)
+    raise SystemExit(1 if recorder.writer.failure else 0)
 
 
 def _custom_data(scene: str, seed: int) -> dict[str, str]:

@@ -1,88 +1,150 @@
 """The recorder at full rate: nothing lost, memory flat, how much of a core, and what it costs a
-1 kHz loop. Run `python -m bench.recorder_soak [SECONDS]` (default 600).
+1 kHz loop. Run `python -m bench.recorder_soak [SECONDS] [--plain]` (default 600 s).
 
-One process publishes poses and wrenches at 1 kHz and, at 30 Hz, deltas of a mesh of 20 000
-tetrahedra (4 500 nodes, all displaced). First alone, then with the recorder beside it.
+Three processes stand for a session: this one publishes poses and wrenches at 1 kHz from a loop set
+up as the trainer's are (`--plain`: without real-time scheduling), a second one deltas of a mesh of
+20 000 tetrahedra (4 500 nodes, all displaced) at 30 Hz, a third one hears all of it, as the other
+nodes of a session do. First without a recorder, then with it, then without it again.
 """
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
 from cutting_trainer_msgs.msg import MeshDelta
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.node import Node
 
 from bags.reader import open_bag
+from haptic_bridge.realtime import prepare
 from haptic_bridge.wire import PoseStampedCodec, WrenchStampedCodec
 from session.domain import reserved_domain
 from session.graph import node_environment, recorder_command
 from tissue_sim.messages import packed
-from tissue_sim.ros import MESH_UPDATES, STREAM, UPDATES
+from tissue_sim.ros import (
+    MESH_UPDATES,
+    NEWEST_BEST_EFFORT,
+    STREAM,
+    UPDATES,
+    polled,
+    take_raw,
+)
 from tissue_sim.timing import PeriodicLoop
 
 NODES = 4500
-BETWEEN_DELTAS = 33
-ALONE = 20.0
+ALONE = 30.0
+POSE, WRENCH, DELTA = '/arm/measured_cp', '/arm/servo_cf', f'/{MESH_UPDATES}'
+FIGURES = ('lateness_p50', 'lateness_p99', 'lateness_p999', 'busy_p50')
 
 
-def main(seconds: float) -> None:
+def main(seconds: float, *, real_time: bool) -> None:
     """Prints one line a measure."""
+    start = multiprocessing.get_context('spawn')
+    deltas = start.Value('Q', 0)
     with reserved_domain('free') as domain, tempfile.TemporaryDirectory() as temporary:
         os.environ.update(node_environment(domain))
-        context = rclpy.Context()
-        rclpy.init(context=context, domain_id=domain)
-        source = Source(context)
-        alone = source.publish(min(ALONE, seconds))
-        bag = Path(temporary) / 'bag'
-        recorder = subprocess.Popen(
-            recorder_command(None, bag, 0).argv, stdout=subprocess.PIPE, text=True
+        others = [
+            start.Process(target=publish_deltas, args=(domain, deltas), daemon=True),
+            start.Process(target=hear, args=(domain,), daemon=True),
+        ]
+        for process in others:
+            process.start()
+        with a_node('device', domain) as node:
+            source = Source(node)
+            time.sleep(5.0)
+            if real_time:
+                print(prepare())
+            before = source.publish(min(ALONE, seconds))
+            beside, said, read, sent = beside_recorder(
+                source, deltas, Path(temporary) / 'bag', seconds
+            )
+            after = source.publish(min(ALONE, seconds))
+        for process in others:
+            process.terminate()
+    for topic, (first, last) in sent.items():
+        print(f'{topic}: sent {last - first}, in the bag {read.get(topic, 0)}')
+    print(said)
+    alone = {name: (before[name] + after[name]) / 2 for name in FIGURES}
+    for name in FIGURES:
+        quantity, _, quantile = name.partition('_')
+        print(
+            f'1 kHz loop, {quantity} {quantile}: {beside[name] * 1e3:.3f} ms with the recorder, '
+            f'{beside[name] / alone[name]:.2f} times without '
+            f'({before[name] * 1e3:.3f} ms before, {after[name] * 1e3:.3f} ms after)'
         )
-        assert recorder.stdout is not None
-        while 'ready' not in recorder.stdout.readline():
-            pass
-        time.sleep(2.0)
-        before, memory = cpu_seconds(recorder.pid), []
-        counts = dict(source.sent)
-        beside = source.publish(seconds, lambda: memory.append(resident(recorder.pid)))
-        used = cpu_seconds(recorder.pid) - before
-        time.sleep(1.0)
-        recorder.send_signal(signal.SIGINT)
-        said = recorder.communicate(timeout=60)[0]
-        read: dict[str, int] = {}
-        for message in open_bag(bag).messages(list(source.sent)):
-            read[message.topic] = read.get(message.topic, 0) + 1
-        for topic, count in source.sent.items():
-            print(f'{topic}: sent {count - counts[topic]}, in the bag {read.get(topic, 0)}')
-        print(said.splitlines()[0])
-        third = max(len(memory) // 3, 1)
-        early, late = np.mean(memory[third : 2 * third]), np.mean(memory[-third:])
-        print(f'memory: {early:.1f} MB in the second third, {late:.1f} MB in the last')
-        print(f'recorder: {100 * used / seconds:.1f} % of a core')
-        ratio = beside['lateness_p99'] / alone['lateness_p99']
-        print(f'1 kHz loop: late p99 {beside["lateness_p99"] * 1e3:.3f} ms, {ratio:.2f} x alone')
+
+
+def beside_recorder(
+    source: 'Source', deltas: 'Synchronized[int]', bag: Path, seconds: float
+) -> tuple[dict[str, float], str, dict[str, int], dict[str, tuple[int, int]]]:
+    """The loop beside a recorder.
+
+    Returns:
+        How the loop kept its deadlines; what the recorder said and used, in lines; messages in the
+        bag, and sent by when the time began and ended, by topic.
+    """
+    recorder = subprocess.Popen(
+        recorder_command(None, bag, 0).argv, stdout=subprocess.PIPE, text=True
+    )
+    assert recorder.stdout is not None
+    while 'ready' not in recorder.stdout.readline():
+        pass
+    time.sleep(2.0)
+    used, memory = -cpu_seconds(recorder.pid), []
+    first = source.sent | {DELTA: deltas.value}
+    figures = source.publish(seconds, lambda: memory.append(resident(recorder.pid)))
+    used += cpu_seconds(recorder.pid)
+    last = source.sent | {DELTA: deltas.value}
+    time.sleep(1.0)
+    recorder.send_signal(signal.SIGINT)
+    said = recorder.communicate(timeout=60)[0]
+    third = max(len(memory) // 3, 1)
+    early, late = np.mean(memory[third : 2 * third]), np.mean(memory[-third:])
+    lines = [
+        said.splitlines()[0],
+        f'memory: {early:.1f} MB in the second third, {late:.1f} MB in the last',
+        f'recorder: {100 * used / seconds:.1f} % of a core',
+    ]
+    read: dict[str, int] = {}
+    for message in open_bag(bag).messages(list(first)):
+        within = message.topic != DELTA or first[DELTA] < message.sequence <= last[DELTA]
+        read[message.topic] = read.get(message.topic, 0) + within
+    return figures, '\n'.join(lines), read, {topic: (first[topic], last[topic]) for topic in first}
+
+
+@contextmanager
+def a_node(name: str, domain: int) -> Iterator[Node]:
+    """A node of this process."""
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node(name, context=context)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
         rclpy.shutdown(context=context)
 
 
 class Source:
-    """Publishes at full rate."""
+    """Publishes poses and wrenches at full rate."""
 
-    def __init__(self, context: rclpy.Context) -> None:
-        node = rclpy.create_node('source', context=context)
-        self._node = node
-        self._pose = node.create_publisher(PoseStamped, '/arm/measured_cp', STREAM)
-        self._wrench = node.create_publisher(WrenchStamped, '/arm/servo_cf', STREAM)
-        self._delta = node.create_publisher(MeshDelta, f'/{MESH_UPDATES}', UPDATES)
-        self._message = MeshDelta(node_count=NODES)
-        self._message.displacement = packed('d', np.random.default_rng(0).random(3 * NODES))
-        self.sent = {'/arm/measured_cp': 0, '/arm/servo_cf': 0, f'/{MESH_UPDATES}': 0}
+    def __init__(self, node: Node) -> None:
+        self._pose = node.create_publisher(PoseStamped, POSE, STREAM)
+        self._wrench = node.create_publisher(WrenchStamped, WRENCH, STREAM)
+        self.sent = {POSE: 0, WRENCH: 0}
 
-    def publish(self, seconds: float, look: object = None) -> dict[str, float]:
+    def publish(self, seconds: float, look: Callable[[], Any] = lambda: None) -> dict[str, float]:
         """Publishes for a time [s]; returns how the loop kept its deadlines."""
         loop = PeriodicLoop(1000.0, window=1 << 20)
         pose, wrench = PoseStampedCodec('arm_base'), WrenchStampedCodec('arm_base')
@@ -92,15 +154,42 @@ class Source:
             now = time.time_ns()
             self._pose.publish(pose.encode(now, (0.1, 0.2, tick * 1e-6, 0.0, 0.0, 0.0, 1.0)))
             self._wrench.publish(wrench.encode(now, (0.0, 0.0, tick * 1e-6, 0.0, 0.0, 0.0)))
-            self.sent['/arm/measured_cp'] += 1
-            self.sent['/arm/servo_cf'] += 1
-            if tick % BETWEEN_DELTAS == 0:
-                self._message.revision = tick
-                self._delta.publish(self._message)
-                self.sent[f'/{MESH_UPDATES}'] += 1
-            if callable(look) and tick % 1000 == 0:
+            for topic in self.sent:
+                self.sent[topic] += 1
+            if tick % 1000 == 0:
                 look()
         return loop.report()
+
+
+def publish_deltas(domain: int, sent: 'Synchronized[int]') -> None:
+    """Publishes deltas for ever; a process of its own, as the simulation is."""
+    with a_node('tissue_sim', domain) as node:
+        publisher = node.create_publisher(MeshDelta, DELTA, UPDATES)
+        message = MeshDelta(node_count=NODES)
+        message.displacement = packed('d', np.random.default_rng(0).random(3 * NODES))
+        loop = PeriodicLoop(30.0)
+        loop.start()
+        while True:
+            loop.wait()
+            message.revision += 1
+            publisher.publish(message)
+            sent.value += 1
+
+
+def hear(domain: int) -> None:
+    """Takes what comes, as the other nodes of a session do."""
+    with a_node('listener', domain) as node:
+        subscriptions = [
+            polled(node, PoseStamped, POSE, NEWEST_BEST_EFFORT),
+            polled(node, WrenchStamped, WRENCH, NEWEST_BEST_EFFORT),
+            polled(node, MeshDelta, DELTA, UPDATES),
+        ]
+        loop = PeriodicLoop(1000.0)
+        loop.start()
+        while True:
+            loop.wait()
+            for subscription in subscriptions:
+                take_raw(subscription)
 
 
 def cpu_seconds(process: int) -> float:
@@ -116,4 +205,5 @@ def resident(process: int) -> float:
 
 
 if __name__ == '__main__':
-    main(float(sys.argv[1]) if sys.argv[1:] else 600.0)
+    numbers = [word for word in sys.argv[1:] if not word.startswith('-')]
+    main(float(numbers[0]) if numbers else 600.0, real_time='--plain' not in sys.argv[1:])

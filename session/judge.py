@@ -39,6 +39,7 @@ def judge(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
     return [
         *(death.sentence for death in outcome.deaths),
         *(f'{name} had to be killed at the end' for name in outcome.killed),
+        *outcome.failures,
         *_bag(summary),
         *_errors(summary),
         *([] if outcome.interrupted else _rates(summary, expected)),
@@ -84,6 +85,8 @@ def _touch(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
         )
     if not outcome.finished:
         failures.append(f'the arm did not finish its script within {outcome.seconds:.0f} s')
+    if not summary.complete:
+        return failures  # what came after the end of the bag is not known
     if not summary.contact_time:
         failures.append('the tool never touched the tissue')
     elif not summary.largest_force:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -54,7 +55,8 @@ class _Log:
             except OSError:
                 return  # where no bag could be made, no log can be kept; the recorder says why
         if self._file is not None:
-            self._file.write(''.join(f'{line}\n' for line in self._waiting).encode())
+            with suppress(OSError):  # the disk is full: the recorder says so, the session goes on
+                self._file.write(''.join(f'{line}\n' for line in self._waiting).encode())
             self._waiting.clear()
 
     def close(self) -> None:

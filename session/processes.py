@@ -62,6 +62,7 @@ class Outcome:
         deaths: of nodes, in order.
         unready: sentence about who was not ready in time.
         killed: nodes that did not end when asked to, in all the time that they have for it.
+        failures: what nodes said in lines `failed: NAME: sentence`.
     """
 
     ran: bool = False
@@ -71,6 +72,7 @@ class Outcome:
     deaths: list[Death] = field(default_factory=list)
     unready: str = ''
     killed: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
 
 
 class Supervisor:
@@ -234,6 +236,8 @@ class Supervisor:
             self._tell(Event('ready', node.name, line))
         elif line == f'done: {node.name}':
             node.done = True
+        elif line.startswith(said := f'failed: {node.name}: '):
+            self.outcome.failures.append(line.removeprefix(said))
         elif line.startswith('phase: '):
             self._tell(Event('phase', node.name, line.removeprefix('phase: ')))
         elif is_warning(line):

@@ -59,7 +59,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ('largest force', f'{summary.largest_force:.2f} N'),
         ('elements cut', str(summary.elements_cut)),
         ('messages recorded', str(summary.messages)),
-        ('messages lost', lost or '0'),
+        ('messages lost', (lost or '0') + ('' if summary.complete else ' before the bag ends')),
     ]
     if unheard:
         rows.append(('sent before recording', str(unheard)))

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rclpy.serialization import serialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
 from rosbags.highlevel import AnyReader
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 
 from bags.reader import open_bag
@@ -246,20 +247,84 @@ def test_service_calls_are_recorded_where_introspection_is_on(
     assert len(recorded(recorder.folder, '/do_it/_service_event')) == len(events) == 2
 
 
-def test_a_killed_recorder_leaves_all_but_the_last_half_second(
-    node: Node, recorder: RecorderProcess
+class Streams(threading.Thread):
+    """Publishes on three topics, two at 1 kHz and the mesh at 30 Hz, and keeps what it sent, when.
+
+    Attributes:
+        sent: time [ns since the epoch] and bytes of each message, by topic.
+    """
+
+    def __init__(self, node: Node) -> None:
+        super().__init__()
+        self.sent: dict[str, list[tuple[int, bytes]]] = {}
+        self._publishers = [
+            (node.create_publisher(PoseStamped, '/arm/measured_cp', QoSProfile(depth=1000)), 1),
+            (node.create_publisher(Contact, f'/{CONTACT}', QoSProfile(depth=1000)), 1),
+            (node.create_publisher(MeshDelta, f'/{MESH_UPDATES}', UPDATES), 33),
+        ]
+        self._ended = threading.Event()
+
+    def run(self) -> None:
+        displacement = [random.Random(2).random() for _ in range(3000)]
+        kinds: list[Callable[[int], Any]] = [
+            lambda i: PoseStamped(header=Header(frame_id=f'device {i}')),
+            lambda i: Contact(sequence=i),
+            lambda i: MeshDelta(revision=i, displacement=displacement),
+        ]
+        deadline = time.monotonic()
+        for i in itertools.count():
+            for (publisher, every), make in zip(self._publishers, kinds, strict=True):
+                if i % every == 0:
+                    data = serialize_message(make(i))
+                    self.sent.setdefault(publisher.topic, []).append((time.time_ns(), data))
+                    publisher.publish(data)
+            deadline += 0.001
+            time.sleep(max(0.0, deadline - time.monotonic()))
+            if self._ended.is_set():
+                return
+
+    def end(self) -> None:
+        self._ended.set()
+        self.join()
+
+
+def kill_while_it_records(folder: Path, delay: float) -> int:
+    """Starts a recorder, and kills it some time [s] after its first messages; returns when [ns]."""
+    recorder = RecorderProcess(folder, seed=11)
+    try:
+        path = folder / f'{folder.name}_0.mcap'
+        wait_for(lambda: path.stat().st_size > 20_000, 'the recorder to hear all')
+        time.sleep(delay)
+        return time.time_ns()
+    finally:
+        recorder.process.kill()
+        recorder.process.communicate()
+
+
+def test_a_recorder_killed_twenty_times_leaves_all_but_the_last_half_second_bit_for_bit(
+    node: Node, tmp_path: Path
 ) -> None:
-    publisher = heard(node, PoseStamped, '/stream', QoSProfile(depth=1000))
-    sent = publish_at_1_khz(publisher, poses(1500))
-    recorder.process.kill()
-    recorder.process.wait()
-    killed = time.time_ns()
-    bag = open_bag(recorder.folder)
-    assert not bag.complete
-    assert bag.custom_data['seed'] == '11'
-    got = list(bag.messages(['/stream']))
-    assert [m.data for m in got] == sent[: len(got)]
-    assert killed - got[-1].log_time < 5e8
+    source, streams = random.Random(4), Streams(node)
+    streams.start()
+    folders = [tmp_path / f'bag{i}' for i in range(20)]
+    delays = [source.uniform(0.0, 0.6) for _ in folders]
+    try:
+        with ThreadPoolExecutor(3) as several:
+            killed = list(several.map(kill_while_it_records, folders, delays))
+    finally:
+        streams.end()
+    for folder, end in zip(folders, killed, strict=True):
+        assert not open_bag(folder).complete
+        assert not repair_bag(folder).whole
+        bag = open_bag(folder)
+        assert bag.complete and bag.custom_data['seed'] == '11'
+        for topic, sent in streams.sent.items():
+            times, all_sent = zip(*sent, strict=True)
+            kept = [m.data for m in bag.messages([topic])]
+            begin = all_sent.index(kept[0])
+            assert tuple(kept) == all_sent[begin : begin + len(kept)]
+            first_missing = begin + len(kept)
+            assert times[first_missing] > end - 5e8
 
 
 def test_what_a_publisher_sent_before_the_recorder_heard_it_is_said(
@@ -306,12 +371,12 @@ def test_a_full_disk_does_not_end_the_recorder_and_the_loss_is_counted_and_said(
     time.sleep(1.5)
     assert recorder.process.poll() is None
     said = recorder.end()
-    assert recorder.process.returncode == 0
+    assert recorder.process.returncode == 1
     written, lost = map(
         int, re.search(r'/stream: 1000 received, (\d+) written, (\d+) lost', said).groups()
     )
     assert written + lost == 1000 and lost > 0
-    assert f'cannot write {path}: File too large' in said
+    assert f'failed: recorder: cannot write {path}: File too large: ' in said
     assert repair_bag(recorder.folder).messages > 0
     assert recorded(recorder.folder, '/stream') == sent[:written]
 

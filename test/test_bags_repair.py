@@ -1,14 +1,8 @@
 """A bag that was cut off or damaged becomes whole again, with all that can be read in it."""
 
-import itertools
-import multiprocessing
 import os
-import random
 import resource
-import time
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from independent_readers import by_rosbags
@@ -16,7 +10,7 @@ from test_bags import add_topics, some_messages, write_all
 
 from bags.errors import BagError
 from bags.metadata import read_metadata
-from bags.reader import Recorded, open_bag
+from bags.reader import open_bag
 from bags.repair import repair_bag
 from bags.writer import BagWriter
 from session.repair import told
@@ -101,49 +95,3 @@ def test_where_there_is_no_room_the_bag_stays_as_it_was(folder: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before
     assert sorted(p.name for p in folder.iterdir()) == ['metadata.yaml', 'session_0.mcap']
-
-
-def endless(count: int) -> Recorded:
-    """A message that anybody can make again who knows its number."""
-    return replace(MESSAGES[count % 500], sequence=count, log_time=MESSAGES[0].log_time + count)
-
-
-def write_for_ever(folder: Path, last: Any) -> None:
-    """Writes as the recorder does: a flush each 0.2 s; says when it wrote last."""
-    writer = BagWriter(folder)
-    add_topics(writer)
-    flushed = time.monotonic()
-    for count in itertools.count():
-        m = endless(count)
-        now = time.time_ns()
-        writer.write(m.topic, m.log_time, now, m.data, m.sequence)
-        last.value = now
-        if time.monotonic() - flushed > 0.2:
-            writer.flush()
-            flushed = time.monotonic()
-        time.sleep(0.0005)
-
-
-def test_a_writer_killed_twenty_times_leaves_all_but_the_last_half_second_bit_for_bit(
-    tmp_path: Path,
-) -> None:
-    source, start = random.Random(4), multiprocessing.get_context('fork')
-    for i in range(20):
-        folder = tmp_path / f'bag{i}'
-        path = folder / f'bag{i}_0.mcap'
-        last = start.Value('q', 0)
-        process = start.Process(target=write_for_ever, args=(folder, last))
-        process.start()
-        while not (path.is_file() and path.stat().st_size > 1000):
-            time.sleep(0.01)
-        time.sleep(source.uniform(0.0, 0.5))
-        process.kill()
-        process.join()
-        repair_bag(folder)
-        bag = open_bag(folder)
-        kept = list(bag.messages())
-        assert bag.complete and kept
-        assert [replace(m, publish_time=0) for m in kept] == [
-            replace(endless(count), publish_time=0) for count in range(len(kept))
-        ]
-        assert last.value - kept[-1].publish_time < 5e8

@@ -6,6 +6,9 @@ deciding loop up by is read off the same stamps and allowed for.
 """
 
 import os
+import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +23,7 @@ from live import (
     HAPTICS,
     MEASURED_CF,
     MEASURED_CP,
+    PATIENCE,
     ROOT,
     SERVO_CF,
     TISSUE_FORCE,
@@ -37,6 +41,8 @@ from live import (
 )
 from rosbags.highlevel import AnyReader
 
+from bags.reader import Recorded, open_bag
+from bags.repair import repair_bag
 from haptic_bridge.node import FOLLOW_PERIOD
 from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
 from session.graph import MODULES, node_environment
@@ -245,3 +251,39 @@ def end(witness: 'subprocess.Popen[str]') -> None:
     witness.send_signal(signal.SIGINT)
     witness.communicate(timeout=20)
     assert witness.returncode == 0
+
+
+def test_session_goes_on_when_the_disk_is_full_and_says_what_is_not_in_the_bag(
+    tmp_path: Path, domain: int
+) -> None:
+    disk, bag = tmp_path / 'disk', tmp_path / 'bag'
+    disk.mkdir()
+    mount = f'mount -t tmpfs -o size=260k none {disk}'
+    namespace = ['unshare', '--user', '--map-root-user', '--mount', 'sh', '-c']
+    if not shutil.which('unshare') or subprocess.run([*namespace, mount], check=False).returncode:
+        pytest.skip('no disk of its own: this system lets users mount nothing')
+    scene = ROOT / 'bags' / 'samples' / 'straight_cut.yaml'
+    demo = [sys.executable, '-m', 'session.cli', 'demo', '--domain', str(domain)]
+    words = shlex.join([*demo, '--scene', str(scene), '--bag', str(disk / 'bag')])
+    done = subprocess.run(
+        [*namespace, f'{mount} && {words}; status=$?; cp -r {disk}/bag {bag}; exit $status'],
+        cwd=ROOT,
+        env=os.environ | {'COLUMNS': '200'},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == Status.FAILED, done.stderr
+    assert 'No space left on device: nothing is recorded from now on' in done.stderr
+    (lost,) = map(int, re.findall(r'device: (\d+) messages are not in the bag', done.stderr))
+    assert lost > 1000 and 'did not finish its script' not in done.stderr
+    assert {path.name for path in bag.iterdir()} == {'bag_0.mcap', 'metadata.yaml', 'log'}
+    before = list(open_bag(bag).messages())
+    assert not repair_bag(bag).whole
+    assert sorted(open_bag(bag).messages(), key=key) == sorted(before, key=key)
+    assert len(before) > 500 and is_complete(bag)
+
+
+def key(message: Recorded) -> tuple[int, str, int]:
+    return message.log_time, message.topic, message.sequence

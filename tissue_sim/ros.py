@@ -155,13 +155,16 @@ def announce_ready(node: Node) -> None:
     print(f'ready: {node.get_name()}', flush=True)
 
 
-def run(make_node: Callable[[], Node], work: Callable[[Any, Stop], None] | None = None) -> None:
+def run(make_node: Callable[[], Node], work: Callable[[Any, Stop], None] | None = None) -> Any:
     """Runs a node to SIGINT or SIGTERM and ends it in order; the main of every node.
 
     Callbacks are served by an executor. Where `work` is given, the executor has a thread of its own
     and `work(node, stop)` has the main thread; it returns soon after `stop` is set. A node may have
     a method `close()`, called before it is destroyed. A ValueError while the node is made ends the
     process with that one sentence and exit status 2.
+
+    Returns:
+        The node, destroyed.
     """
     rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
     stop = Stop()
@@ -189,6 +192,7 @@ def run(make_node: Callable[[], Node], work: Callable[[Any, Stop], None] | None 
             node.close()
         node.destroy_node()
         rclpy.shutdown()
+    return node
 
 
 def _spin(executor: SingleThreadedExecutor, node: Node, stop: Stop) -> None:
