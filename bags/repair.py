@@ -1,7 +1,7 @@
 """A bag that a crash or a full disk has cut off becomes whole again, without what is gone."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,18 +80,24 @@ def repair_bag(folder: Path) -> Repair:
     return result
 
 
-def copy_bag(source: Path, target: Path) -> None:
+def copy_bag(source: Path, target: Path, *, since: int = 0, without: Collection[str] = ()) -> None:
     """Writes a whole bag once more, as few chunks as it takes, its messages bit for bit.
 
     Args:
         source: folder of the bag.
         target: folder of the new one.
+        since: smallest log time to be copied [ns since the epoch].
+        without: topics to be left out.
 
     Raises:
         BagError: it is not a bag, or the new one cannot be written.
     """
     writer = BagWriter(target, custom_data=_custom_data(source))
     for chunk in salvage(mcap_file(source)):
+        chunk.channels = [c for c in chunk.channels if c.topic not in without]
+        chunk.messages = [
+            (c, m) for c, m in chunk.messages if m.log_time >= since and c.topic not in without
+        ]
         _copy(chunk, writer)
     writer.close()
     if writer.failure:

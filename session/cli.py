@@ -185,17 +185,20 @@ def export(
     output: Annotated[
         Path,
         typer.Argument(
-            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), or a folder for CSV.'
+            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), or a folder for tables.'
         ),
     ],
     at: Annotated[
         float | None, typer.Option(min=0.0, help='Moment of the mesh [s] (default: the end).')
     ] = None,
+    parquet: Annotated[
+        bool, typer.Option('--parquet', help='Write tables as Parquet, not as CSV.')
+    ] = False,
 ) -> None:
-    """Write a bag's poses and forces as CSV, or its tissue as a mesh."""
+    """Write a bag's poses and forces as CSV or Parquet, or its tissue as a mesh."""
     from session.export import export as write
 
-    for file in write(bag, output, at):
+    for file in write(bag, output, at, parquet=parquet):
         Console().print(f'wrote {file}', highlight=False)
 
 

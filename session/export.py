@@ -1,10 +1,14 @@
-"""`trainer export`: a bag's streams as CSV, its tissue at a moment as a mesh file."""
+"""`trainer export`: a bag's streams as CSV or Parquet, its tissue at a moment as a mesh file."""
 
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import meshio
 import numpy as np
+import pyarrow as pa
+from pyarrow import parquet as pq
 
 from bags.player import first_time
 from bags.reader import Bag, open_bag
@@ -31,16 +35,18 @@ _STREAMS: dict[str, type[StampedCodec]] = {
     CONTACT: ContactCodec,
     FORCE: ForceSampleCodec,
 }
+_TYPES = {'d': np.float64, 'i': np.int32, 'I': np.uint32, 'Q': np.uint64, 'B': np.uint8}
 _AXES = {3: 'xyz', 4: 'xyzw'}
 
 
-def export(folder: Path, output: Path, at: float | None) -> list[Path]:
-    """Writes a mesh file where `output` has the ending of one, else a folder of CSV files.
+def export(folder: Path, output: Path, at: float | None, *, parquet: bool = False) -> list[Path]:
+    """Writes a mesh file where `output` has the ending of one, else a folder of tables.
 
     Args:
         folder: of the bag.
         output: file, or new folder.
         at: moment of the mesh [s]; None: the end.
+        parquet: write the tables as Parquet, not as CSV.
 
     Returns:
         What was written.
@@ -58,12 +64,14 @@ def export(folder: Path, output: Path, at: float | None) -> list[Path]:
     if output.suffix:
         endings = ', '.join(SOLIDS + SURFACES)
         raise SessionError(
-            f'{output}: a mesh ends in {endings}; a name without an ending is a folder for CSV'
+            f'{output}: a mesh ends in {endings}; a name without an ending is a folder for tables'
         )
     if at is not None:
         raise SessionError('--at is the moment of a mesh: streams are written as a whole')
+    if output.is_file():
+        raise SessionError(f'{output} is a file: name a folder for the tables')
     output.mkdir(exist_ok=True)
-    return write_streams(bag, output)
+    return write_streams(bag, output, parquet=parquet)
 
 
 def write_mesh(tissue: MeshReplica, file: Path) -> None:
@@ -82,7 +90,7 @@ def write_mesh(tissue: MeshReplica, file: Path) -> None:
     meshio.Mesh(tissue.positions()[used], cells).write(file)
 
 
-def write_streams(bag: Bag, folder: Path) -> list[Path]:
+def write_streams(bag: Bag, folder: Path, *, parquet: bool) -> list[Path]:
     """One file a stream: time of recording [s], stamp [ns], then the fields in SI units."""
     files = []
     origin = first_time(bag)
@@ -90,22 +98,38 @@ def write_streams(bag: Bag, folder: Path) -> list[Path]:
         name = of_session(topic, bag.topics())
         if name not in bag.topics():
             continue
-        codec = kind()
-        file = folder / f'{topic[1:].replace("/", "_")}.csv'
-        with file.open('w', encoding='utf-8', newline='\n') as out:
-            out.write(','.join(['time', 'stamp_ns', *columns(kind)]) + '\n')
-            for recorded in bag.messages([name]):
-                sample = codec.decode(recorded.data)
-                time = (recorded.log_time - origin) * 1e-9
-                row: list[Any] = [f'{time:.9f}', sample.stamp_ns, *sample.values]
-                out.write(','.join(map(str, row)) + '\n')
-        files.append(file)
+        ending = 'parquet' if parquet else 'csv'
+        files.append(folder / f'{topic[1:].replace("/", "_")}.{ending}')
+        write = _write_parquet if parquet else _write_csv
+        write(files[-1], kind, _rows(bag, name, kind(), origin))
     return files
 
 
+def _rows(bag: Bag, topic: str, codec: StampedCodec, origin: int) -> Iterator[Sequence[Any]]:
+    for recorded in bag.messages([topic]):
+        sample = codec.decode(recorded.data)
+        yield (recorded.log_time - origin) * 1e-9, sample.stamp_ns, *sample.values
+
+
+def _write_csv(file: Path, kind: type[StampedCodec], rows: Iterator[Sequence[Any]]) -> None:
+    with file.open('w', encoding='utf-8', newline='\n') as out:
+        out.write(','.join(columns(kind)) + '\n')
+        for time, *values in rows:
+            out.write(','.join(map(str, [f'{time:.9f}', *values])) + '\n')
+
+
+def _write_parquet(file: Path, kind: type[StampedCodec], rows: Iterator[Sequence[Any]]) -> None:
+    names = columns(kind)
+    codes = chain.from_iterable([_TYPES[code]] * count for _, code, count in kind.layout)
+    types = [np.float64, np.int64, *codes]
+    read = list(zip(*rows, strict=True)) or [()] * len(names)
+    arrays = [np.array(column, type_) for column, type_ in zip(read, types, strict=True)]
+    pq.write_table(pa.table(dict(zip(names, arrays, strict=True))), file)
+
+
 def columns(kind: type[StampedCodec]) -> list[str]:
-    """Names of a message's numbers: `force_x`, or `weights_0` where there are no axes."""
-    names = []
+    """Names of a row's numbers: `force_x`, or `weights_0` where there are no axes."""
+    names = ['time', 'stamp_ns']
     for name, _, count in kind.layout:
         axes = _AXES.get(count, [str(i) for i in range(count)])
         names += [name] if count == 1 else [f'{name}_{axis}' for axis in axes]

@@ -268,13 +268,13 @@ def _path_figure(story: Story, script: ScriptSettings | None) -> Figure:
     axes: Any = figure.subplots()
     tool = story.tool[::_EVERY]
     tips = tool[:, 1:4] * _MM
-    axes.plot(tips[:, 0], tips[:, 1], color='#8a8a8a', lw=0.8, label='way of the tip')
-    inside = np.where(tool[:, 10:] == INSIDE, tips, np.nan)
-    axes.plot(inside[:, 0], inside[:, 1], color='#9e0914', lw=1.8, label='blade in the tissue')
     for number, way in enumerate(planned_ways(script) if script else []):
         corners = way[:, :2].T * _MM
         label = 'planned cut' if number == 0 else None
-        axes.plot(*corners, color='black', lw=0.9, ls='--', label=label)
+        axes.plot(*corners, color='#b9d0ea', lw=6.0, solid_capstyle='butt', label=label)
+    axes.plot(tips[:, 0], tips[:, 1], color='#8a8a8a', lw=0.8, label='way of the tip')
+    inside = np.where(tool[:, 10:] == INSIDE, tips, np.nan)
+    axes.plot(inside[:, 0], inside[:, 1], color='#9e0914', lw=1.5, label='blade in the tissue')
     axes.set(xlabel='x [mm]', ylabel='y [mm]', aspect='equal')
     axes.legend(frameon=False, fontsize=8)
     return figure

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from meshes import box
+from pyarrow import parquet as pq
 
 from bags.errors import BagError
 from bags.reader import open_bag
@@ -115,6 +116,15 @@ def test_streams_are_exported_number_for_number(tmp_path: Path) -> None:
         s.values[codec.fields['force']][2] for s in samples
     ]
     assert [int(row['stamp_ns']) for row in rows] == [s.stamp_ns for s in samples]
+    for table in export(PALPATION, tmp_path / 'parquet', None, parquet=True):
+        read = pq.read_table(table)
+        with (tmp_path / 'csv' / f'{table.stem}.csv').open() as lines:
+            names, *texts = csv.reader(lines)
+        assert read.column_names == names
+        for column, name in zip(zip(*texts, strict=True), names, strict=True):
+            got = read[name].to_numpy()
+            exact = got.round(9) if name == 'time' else got
+            assert exact.tolist() == [float(x) if got.dtype == float else int(x) for x in column]
     with (tmp_path / 'csv' / 'arm_servo_cf.csv').open() as file:
         assert sum(1 for _ in file) == 1 + sum(1 for _ in bag.messages([SERVO_CF]))
 
