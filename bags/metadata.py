@@ -10,6 +10,8 @@ import yaml
 from bags.errors import BagError
 from bags.qos import Profiles, metadata_profiles
 
+FORMAT_VERSION = 2
+"""Version of what our bags hold beyond rosbag2's own format; grows when a reader must know."""
 METADATA_FILE = 'metadata.yaml'
 _ROOT = 'rosbag2_bagfile_information'
 
@@ -132,8 +134,12 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     path = folder / METADATA_FILE
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
-        return dict(content[_ROOT])
     except FileNotFoundError:
         raise BagError(f'{folder} is not a bag: it has no {METADATA_FILE}') from None
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except NotADirectoryError:
+        raise BagError(f'{folder} is a file: name the folder of the bag, {folder.parent}') from None
+    except (yaml.YAMLError, ValueError) as error:
         raise BagError(f'{path} is not the metadata of a bag: {error}') from None
+    if not (isinstance(content, dict) and isinstance(content.get(_ROOT), dict)):
+        raise BagError(f'{path} is not the metadata of a bag: it has no {_ROOT}')
+    return dict(content[_ROOT])

@@ -17,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from bags.errors import BagError
 from bags.message_class import message_class
 from bags.message_text import schema_text
+from bags.metadata import FORMAT_VERSION
 from bags.parameters import ParameterCollector
 from bags.qos import OfferedQos
 from bags.sequences import SequenceCounter
@@ -40,9 +41,6 @@ from tissue_sim.ros import (
     run,
 )
 from tissue_sim.share import share_folder
-
-FORMAT_VERSION = '2'
-"""Version of what our bags hold beyond rosbag2's own format; grows when a reader must know."""
 
 _POLL = 0.004
 _DISCOVER = 0.02
@@ -270,7 +268,7 @@ def main() -> None:
 
 def _custom_data(scene: str, seed: int) -> dict[str, str]:
     data = {
-        'format_version': FORMAT_VERSION,
+        'format_version': str(FORMAT_VERSION),
         'seed': str(seed),
         'python_version': platform.python_version(),
     }

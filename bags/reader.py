@@ -16,7 +16,7 @@ from mcap.stream_reader import breakup_chunk
 
 from bags.cdr import Decoder
 from bags.errors import BagError
-from bags.metadata import read_metadata
+from bags.metadata import FORMAT_VERSION, read_metadata
 from bags.qos import OfferedQos, profiles_from
 
 _MAGIC = b'\x89MCAP0\r\n'
@@ -85,6 +85,9 @@ class Bag:
         Args:
             topics: those to read; all by default.
             since: smallest log time [ns since the epoch].
+
+        Raises:
+            BagError: something in it is damaged.
         """
         source = self._indexed(topics, since) if self.complete else self._salvage()
         for schema, channel, message in source:
@@ -139,9 +142,15 @@ class Bag:
     ) -> Iterator[tuple[Schema, Channel, Message]]:
         with self.path.open('rb') as file:
             reader = make_reader(file, validate_crcs=True)
-            for schema, channel, message in reader.iter_messages(topics, starting_at=since):
-                assert schema is not None
-                yield schema, channel, message
+            try:
+                for schema, channel, message in reader.iter_messages(topics, starting_at=since):
+                    assert schema is not None
+                    yield schema, channel, message
+            except Exception as error:  # whatever the damage makes a parser say
+                raise BagError(
+                    f'{self.path} is damaged ({error}): `trainer repair` makes it readable again, '
+                    'without what is damaged'
+                ) from None
 
     def _salvage(self) -> Iterator[tuple[Schema, Channel, Message]]:
         for chunk in salvage(self.path):
@@ -158,14 +167,19 @@ def open_bag(folder: Path | str) -> Bag:
         folder: the bag's folder, the one with metadata.yaml.
 
     Raises:
-        BagError: it is not a bag of one MCAP file.
+        BagError: it is not a bag of one MCAP file, or of a format to come.
     """
     folder = Path(folder)
-    if folder.is_file():
-        raise BagError(f'{folder} is a file: name the folder of the bag, {folder.parent}')
     information = read_metadata(folder)
     path = mcap_file(folder)
-    return Bag(path, dict(information.get('custom_data') or {}))
+    data = dict(information.get('custom_data') or {})
+    version = str(data.get('format_version', FORMAT_VERSION))
+    if not version.isdigit() or int(version) > FORMAT_VERSION:
+        raise BagError(
+            f'{folder} has format {version}: this trainer reads formats up to {FORMAT_VERSION}, '
+            'a newer one is needed'
+        )
+    return Bag(path, data)
 
 
 def mcap_file(folder: Path) -> Path:
@@ -179,9 +193,9 @@ def mcap_file(folder: Path) -> Path:
         names = information.get('relative_file_paths') or []
         storage = information.get('storage_identifier')
     except BagError:
-        names, storage = [path.name for path in folder.glob('*.mcap')], 'mcap'
-        if not names:
+        if folder.is_file() or not any(folder.glob('*.mcap')):
             raise
+        names, storage = [path.name for path in folder.glob('*.mcap')], 'mcap'
     if storage != 'mcap' or len(names) != 1:
         raise BagError(f'{folder} is not a bag of one MCAP file: it names {names}')
     path = folder / Path(names[0]).name

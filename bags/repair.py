@@ -49,7 +49,7 @@ def repair_bag(folder: Path) -> Repair:
         folder: of the bag.
 
     Raises:
-        BagError: it is no bag, or there is no room.
+        BagError: it is no bag, nothing in it can be saved, or there is no room.
     """
     folder = Path(folder)
     path = mcap_file(folder)
@@ -68,6 +68,8 @@ def repair_bag(folder: Path) -> Repair:
         writer.close()
         if writer.failure:
             raise BagError(f'{writer.failure}: {folder} is as it was')
+        if (result.cut_off or result.damaged) and not writer.tally.messages:
+            raise BagError(f'{path} has no chunk that is whole: {folder} is as it was')
         written = writer.folder / f'{folder.resolve().name}_0.mcap'
         written.replace(folder / written.name)
         if path.name != written.name:

@@ -70,6 +70,8 @@ def export(folder: Path, output: Path, at: float | None, *, parquet: bool = Fals
         raise SessionError('--at is the moment of a mesh: streams are written as a whole')
     if output.is_file():
         raise SessionError(f'{output} is a file: name a folder for the tables')
+    if not any(of_session(topic, bag.topics()) in bag.topics() for topic in _STREAMS):
+        raise SessionError(f'{folder} has none of the streams {", ".join(_STREAMS)}')
     output.mkdir(exist_ok=True)
     return write_streams(bag, output, parquet=parquet)
 

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from bags.node import FORMAT_VERSION
+from bags.metadata import FORMAT_VERSION
 from bags.reader import Bag, open_bag
 from bags.repair import copy_bag
 from bags.topics import DIAGNOSTICS

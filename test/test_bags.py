@@ -19,9 +19,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bags.errors import BagError
 from bags.message_text import schema_text
-from bags.metadata import read_metadata
+from bags.metadata import FORMAT_VERSION, read_metadata
 from bags.qos import INFINITE, OfferedQos, channel_profiles, metadata_profiles
 from bags.reader import Recorded, open_bag
+from bags.repair import repair_bag
 from bags.sequences import SequenceCounter
 from bags.writer import BagWriter
 
@@ -320,6 +321,32 @@ def test_what_is_not_a_bag_is_named(tmp_path: Path) -> None:
     (tmp_path / 'metadata.yaml').write_text('[1, 2]')
     with pytest.raises(BagError, match='not the metadata of a bag'):
         open_bag(tmp_path)
+    for read in (open_bag, repair_bag):
+        with pytest.raises(BagError, match='is a file: name the folder'):
+            read(tmp_path / 'metadata.yaml')
+
+
+def test_a_format_to_come_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / 'bag'
+    BagWriter(folder, custom_data={'format_version': str(FORMAT_VERSION)}).close()
+    assert open_bag(folder).complete
+    file = folder / 'metadata.yaml'
+    now, later = f"format_version: '{FORMAT_VERSION}'", f"format_version: '{FORMAT_VERSION + 1}'"
+    file.write_text(file.read_text().replace(now, later))
+    with pytest.raises(BagError, match=f'reads formats up to {FORMAT_VERSION}'):
+        open_bag(folder)
+    file.write_text(file.read_text().replace(later, now))
+
+
+def test_a_damaged_byte_in_a_bag_with_an_end_is_found_and_named(folder: Path) -> None:
+    path = folder / 'session_0.mcap'
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(BagError, match=r'is damaged .* repair'):
+        list(open_bag(folder).messages())
+    assert repair_bag(folder).damaged == 1
+    assert len(list(open_bag(folder).messages())) == 450
 
 
 def installed_types() -> list[str]:

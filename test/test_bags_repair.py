@@ -77,6 +77,13 @@ def test_a_damaged_chunk_in_the_middle_costs_its_own_messages_only(folder: Path)
     assert [m for m in MESSAGES if m in kept] == kept
 
 
+def test_a_bag_of_which_nothing_can_be_saved_stays_as_it_was(folder: Path) -> None:
+    before = cut(folder, 60).read_bytes()
+    with pytest.raises(BagError, match='no chunk that is whole'):
+        repair_bag(folder)
+    assert (folder / 'session_0.mcap').read_bytes() == before
+
+
 def test_a_bag_without_metadata_gets_it_back(folder: Path) -> None:
     (folder / 'metadata.yaml').unlink()
     assert not repair_bag(folder).whole

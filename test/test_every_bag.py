@@ -29,6 +29,8 @@ def every_bag(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Topics]:
         known.add(data)
         folder = path.parent
         if not data.endswith(MAGIC):
+            if not open_bag(folder).span[0]:
+                continue  # it was cut off before its first chunk was written
             folder = shutil.copytree(folder, mended / str(len(found)) / folder.name)
             assert not repair_bag(folder).whole, path
         assert open_bag(folder).complete, path
