@@ -27,7 +27,7 @@ from tissue_sim.share import PACKAGES, is_checkout
 
 SESSIONS = (PACKAGES if is_checkout() else Path()) / 'bags' / 'sessions'
 """In the checkout; in the current folder where the trainer is installed."""
-SHORTEST, LONGEST = 5.0, 86400.0  # [s]
+SHORTEST, LONGEST = 1.0, 86400.0  # [s]
 OVERTIME = 15.0
 """How long [s] a session may last beyond its script, which waits for the haptic bridge."""
 

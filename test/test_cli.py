@@ -124,7 +124,7 @@ def test_duration_that_cannot_be_is_refused(
     capsys: pytest.CaptureFixture[str], seconds: str
 ) -> None:
     assert trainer('demo', '--seconds', seconds) == Status.BAD_INPUT
-    assert 'from 5 to 86400' in one_error_line(capsys)
+    assert 'from 1 to 86400' in one_error_line(capsys)
 
 
 def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,13 @@
 """What a replay plays and when, what it can reach, and with whom it does not mix."""
 
+import itertools
 import os
+import pty
+import re
+import select
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,9 +18,10 @@ from cutting_trainer_msgs.msg import ForceSample, Mesh, MeshDelta
 from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
-from bags.player import STEP, Playhead, RecordedHand, RecordedStream, duration
+from bags.errors import BagError
+from bags.player import STEP, Playhead, ReadAhead, RecordedHand, RecordedStream, duration
 from bags.player_node import SessionPlayer, publisher_qos
-from bags.reader import open_bag
+from bags.reader import Recorded, open_bag
 from bags.topics import CONTACT, FORCE, MESH, OF_DEVICE, OF_TISSUE, POSE, SERVO_CF, UPDATES
 from session.domain import reserved_domain
 from session.errors import SessionError
@@ -78,6 +84,23 @@ def test_a_stream_gives_every_message_once_in_order_and_none_early() -> None:
     late = list(stream.due(1e9))
     assert [*early, *late] == list(bag.messages(OF_TISSUE))
     assert early[-1].log_time <= first + middle * 1e9 < late[0].log_time
+
+
+def test_what_goes_wrong_while_reading_ahead_is_raised_where_it_is_due() -> None:
+    first = next(iter(open_bag(SAMPLE).messages()))
+
+    def damaged() -> Iterator[Recorded]:
+        yield from [first] * 700
+        raise BagError('damaged')
+
+    ahead = ReadAhead(damaged())
+    read = iter(ahead)
+    assert [next(read) for _ in range(700)] == [first] * 700
+    with pytest.raises(BagError, match='damaged'):
+        next(read)
+    endless = ReadAhead(itertools.repeat(first))
+    assert next(iter(endless)) == first
+    endless.close()
 
 
 def test_entering_in_the_middle_works_from_the_next_keyframe() -> None:
@@ -198,6 +221,70 @@ def test_a_replay_into_a_live_graph_is_refused_in_one_line(context: rclpy.Contex
     finally:
         player.stop()
         node.destroy_node()
+
+
+class Terminal:
+    """A command on a terminal of its own.
+
+    Attributes:
+        process: of the command.
+    """
+
+    def __init__(self, *arguments: str) -> None:
+        self._ours, self._theirs = pty.openpty()
+        self._settings = termios.tcgetattr(self._theirs)
+        self._said = ''
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', 'session.cli', *arguments],
+            cwd=ROOT,
+            env=os.environ | {'TERM': 'xterm', 'COLUMNS': '120'},
+            stdin=self._theirs,
+            stdout=self._theirs,
+            stderr=self._theirs,
+        )
+
+    def press(self, key: str) -> None:
+        os.write(self._ours, key.encode())
+
+    def wait_for(self, pattern: str) -> re.Match[str]:
+        """The last match of a pattern in what was said since the last call; waits for one."""
+        deadline = time.monotonic() + 60.0
+        while not (found := list(re.finditer(pattern, self._said))):
+            assert time.monotonic() < deadline, self._said
+            if select.select([self._ours], [], [], 0.1)[0]:
+                self._said += os.read(self._ours, 1 << 16).decode(errors='replace')
+        self._said = ''
+        return found[-1]
+
+    def end(self) -> int:
+        """Waits for the end; returns the exit status."""
+        return self.process.wait(30.0)
+
+    def is_as_before(self) -> bool:
+        """Whether the terminal has the settings that it had."""
+        return termios.tcgetattr(self._theirs) == self._settings
+
+
+def test_keys_of_a_terminal_pause_a_replay_step_it_and_end_it() -> None:
+    options = ('--as-recorded', '--loop', '--start', '2', '--rate', '0.5', '--domain', 'free')
+    terminal = Terminal('replay', str(SAMPLE), *options)
+    try:
+        began = float(terminal.wait_for(r'replaying[^\n]*?([\d.]+) of [\d.]+ s').group(1))
+        terminal.press(' ')
+        paused = r'paused[^\n]*?([\d.]+) of [\d.]+ s'
+        terminal.wait_for(paused)
+        stood = float(terminal.wait_for(paused).group(1))
+        assert 2.0 <= began <= stood
+        terminal.press('s')
+        while (stepped := float(terminal.wait_for(paused).group(1))) == stood:
+            pass
+        assert stepped == pytest.approx(stood + STEP, abs=0.011)
+        terminal.press('q')
+        assert terminal.end() == 0
+        assert terminal.is_as_before()
+    finally:
+        terminal.process.kill()
+        terminal.process.wait()
 
 
 @pytest.mark.slow

@@ -164,6 +164,16 @@ def test_node_that_never_reports_and_node_without_rates_are_told(good: Summary) 
     assert failures == ['tissue_sim never reported its rate on /diagnostics']
 
 
+def test_a_session_too_short_for_reports_of_rates_is_judged_by_the_rest(good: Summary) -> None:
+    nodes = {
+        name: dataclasses.replace(node, rate=math.nan, lowest_rate=math.nan)
+        for name, node in good.nodes.items()
+    }
+    short = dataclasses.replace(good, nodes=nodes)
+    assert judge(short, dataclasses.replace(FINISHED, seconds=3.0), EXPECTED) == []
+    assert len(judge(short, FINISHED, EXPECTED)) == len(RATES)
+
+
 def test_error_on_diagnostics_is_told_and_a_warning_is_not() -> None:
     evidence = session()
     evidence.statuses.append(status('haptic_bridge', 8.0, 1, 'the simulation is silent'))
