@@ -4,7 +4,6 @@ import queue
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import suppress
-from itertools import islice
 
 import numpy as np
 
@@ -102,11 +101,19 @@ class ReadAhead:
         self._thread.join()
 
     def _read(self) -> None:
+        batch: list[Recorded] = []
         try:
-            while batch := list(islice(self._source, _BATCH)):
-                self._put(batch)
+            for message in self._source:
+                batch.append(message)
+                if len(batch) == _BATCH:
+                    self._put(batch)
+                    batch = []
+                if self._closed.is_set():
+                    return
         except Exception as error:  # whatever a damaged bag makes a parser say
             self._failure = error
+        if batch:
+            self._put(batch)
         self._put([])
 
     def _put(self, batch: list[Recorded]) -> None:
