@@ -288,14 +288,25 @@ class Streams(threading.Thread):
         self.join()
 
 
+def held_up(process: int) -> int:
+    """How long [ns] the threads of a process have waited for a processor since they began."""
+    tasks = Path(f'/proc/{process}/task').iterdir()
+    return sum(int((task / 'schedstat').read_text().split()[1]) for task in tasks)
+
+
 def kill_while_it_records(folder: Path, delay: float) -> int:
-    """Starts a recorder, and kills it some time [s] after its first messages; returns when [ns]."""
+    """Starts a recorder, and kills it some time [s] after its first messages.
+
+    Returns:
+        When [ns since the epoch], less the time for which it had no processor while it recorded.
+    """
     recorder = RecorderProcess(folder, seed=11)
     try:
+        before = held_up(recorder.process.pid)
         path = folder / f'{folder.name}_0.mcap'
         wait_for(lambda: path.stat().st_size > 20_000, 'the recorder to hear all')
         time.sleep(delay)
-        return time.time_ns()
+        return time.time_ns() - (held_up(recorder.process.pid) - before)
     finally:
         recorder.process.kill()
         recorder.process.communicate()
