@@ -1,7 +1,7 @@
 """Records the sample sessions anew: `python -m session.make_samples [FOLDER]`.
 
-Each is a live session of `trainer demo` in a scene of bags/samples. What comes before the first
-message of a stream is left out, as are the topics that name files of this machine; all the rest is
+Each is a live session of `trainer demo` in a scene of bags/samples. What comes before tissue and
+force loop are there is left out, as are the topics that name files of this machine; all the rest is
 written once more, message by message as it was, with chunks as large as they come. Only a session
 that did what it should, and is computed again bit for bit, becomes a sample; nothing is replaced
 before all are there. Samples of a released format stay: new ones go into a folder named after their
@@ -17,7 +17,7 @@ from pathlib import Path
 from bags.metadata import FORMAT_VERSION
 from bags.reader import Bag, open_bag
 from bags.repair import copy_bag
-from bags.topics import DIAGNOSTICS
+from bags.topics import CONTACT, MESH
 from session.errors import SessionError
 from session.picture import make_picture
 from session.resimulate import resimulate
@@ -72,7 +72,7 @@ def record_sample(folder: Path, name: str) -> Path:
         scene = ['--scene', str(folder / f'{name}.yaml'), '--bag', str(bag)]
         if subprocess.run([*command, *scene], check=False).returncode != Status.OK:
             continue
-        copy_bag(bag, sample, since=first_of_a_stream(open_bag(bag)), without=_LEFT_OUT)
+        copy_bag(bag, sample, since=begin_of_session(open_bag(bag)), without=_LEFT_OUT)
         if resimulate(sample, {}) is Status.OK:
             return sample
     raise SessionError(
@@ -81,10 +81,9 @@ def record_sample(folder: Path, name: str) -> Path:
     )
 
 
-def first_of_a_stream(bag: Bag) -> int:
-    """When the first message came [ns since the epoch] that is not about the nodes themselves."""
-    streams = bag.topics().keys() - {DIAGNOSTICS, *_LEFT_OUT}
-    return min((m.log_time for m in bag.messages(streams)), default=0)
+def begin_of_session(bag: Bag) -> int:
+    """When the tissue or a tick of the force loop came first [ns since the epoch]."""
+    return next((m.log_time for m in bag.messages([MESH, CONTACT])), 0)
 
 
 if __name__ == '__main__':

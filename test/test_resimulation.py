@@ -215,4 +215,11 @@ def test_the_command_says_identical(
 
 def test_a_copy_has_the_same_messages(tmp_path: Path) -> None:
     copy_bag(CUT, tmp_path / 'copy')
-    assert list(open_bag(tmp_path / 'copy').messages()) == list(open_bag(CUT).messages())
+    every = list(open_bag(CUT).messages())
+    assert list(open_bag(tmp_path / 'copy').messages()) == every
+    since = every[len(every) // 2].log_time
+    copy_bag(CUT, tmp_path / 'part', since=since, without=['/diagnostics'])
+    assert list(open_bag(tmp_path / 'part').messages()) == [
+        m for m in every if m.log_time >= since and m.topic != '/diagnostics'
+    ]
+    assert '/diagnostics' not in open_bag(tmp_path / 'part').topics()
