@@ -15,6 +15,9 @@ _VELOCITY_FILTER = 0.005
 _RECOVERY = 0.02
 """[s] in which the passivity controller takes back what was made; faster is felt as a kick."""
 
+_UNKNOWN = 0.1
+"""Largest part of the device's force for a tissue of which nothing is known yet."""
+
 SETUP = np.dtype(
     [
         ('rotation', 'f8', (3, 3)),  # device frame to tissue frame
@@ -26,6 +29,7 @@ SETUP = np.dtype(
         ('law', 'i8'),
         ('one_force', 'b1'),
         ('max_stiffness', 'f8'),  # [N/m], of the tissue
+        ('unknown_force', 'f8'),  # [N], of a tissue that has not said how stiff it is
         ('max_damping', 'f8'),  # [N s/m]
         ('max_force', 'f8'),  # [N]
         ('max_slew', 'f8'),  # [N/s]
@@ -70,6 +74,7 @@ def make_setup(
     # The tissue is felt through the coupling spring: no slope steeper than that is real.
     rendered = profile.max_stiffness / (frame.scale * haptics.force_scale)
     setup['max_stiffness'] = min(rendered, tool.coupling_stiffness)
+    setup['unknown_force'] = _UNKNOWN * profile.max_force / haptics.force_scale
     setup['max_damping'] = haptics.max_damping
     setup['max_force'] = profile.max_force
     setup['max_slew'] = profile.max_slew
@@ -135,6 +140,8 @@ def _tissue_force(
         )
     elif contact == TOUCHING:
         out[:] = -s.external  # as long as the tissue has not answered
+        if h.count == 0 and not np.any(h.stiffness):
+            safety.clamp(c.unknown_force, out)
     if contact == TOUCHING:
         outward = out[0] * s.normal[0] + out[1] * s.normal[1] + out[2] * s.normal[2]
         if outward < 0.0:

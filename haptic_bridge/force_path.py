@@ -251,11 +251,11 @@ class ForcePath:
                 topology=said.topology,
                 state=said.state,
             )
-        elif self._contact == NONE and said.sequence > self._left:
-            # What the tissue says of a place that the tool comes near to.
+        elif said.sequence > self._left and not self._history['count'][0]:
+            # What the tissue says of a place that the tool comes near to, or has touched since.
             if said.stiffness.any():
                 self._history['stiffness'] = said.stiffness
-            if said.state == NONE:
+            if said.state == NONE and self._contact == NONE:
                 self._ground.answered_free(now_ns, said.revision)
         return ''
 
@@ -316,8 +316,9 @@ class ForcePath:
         self._contact = TOUCHING if touched.touching else NONE
         if self._contact != before:
             extrapolation.clear(self._history)
-            self._left = self._sequence
         if not touched.touching:
+            if before == TOUCHING:
+                self._left = self._sequence
             return touched
         self._ground.press()
         if before != TOUCHING:

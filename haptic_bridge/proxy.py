@@ -27,8 +27,8 @@ class Touch:
         weights: share of each in the load: barycentric in a triangle, times the share of the
             triangle; not negative, sum 1 in all; 0 where unused, shape (9,).
 
-    Where nothing is touched, contact to weights are those of the nearest point within five radii;
-    all weights are 0 if there is none.
+    Where nothing is touched, contact to weights are those of the nearest point; all weights are 0
+    if there is none.
         valid: False where the last input was not finite; nothing has changed then.
     """
 

@@ -51,8 +51,6 @@ _ENTRY = 0.01
 """Height in radii over the surface from which a proxy that was inside is pushed out."""
 _TOUCH = 0.01
 """Gap under the sphere, in radii, that still is contact: on an edge the search ends just above."""
-_FORESIGHT = 5.0
-"""Distance in radii from which a free sphere names the triangle that it comes to."""
 _SHARING = 0.02
 """How much farther than the nearest, in parts, a triangle may be to take its share."""
 _SAME = 0.9999
@@ -283,7 +281,7 @@ def _report(surface: Geometry, blend: float, radius: float, state: np.ndarray) -
     s.touching = False
     nearest = near.distance[near.order[0]] if near.count > 0 else np.inf
     if s.depth <= 1e-9 or nearest > (1.0 + _TOUCH) * radius:
-        _foresee(surface, blend, radius, state)
+        _foresee(surface, blend, state)
         return
     found = _touched(surface, max(nearest * (1.0 + _SHARING), nearest + TIED), state)
     residual = s.step
@@ -303,13 +301,13 @@ def _report(surface: Geometry, blend: float, radius: float, state: np.ndarray) -
 
 
 @njit(cache=True, nogil=True)
-def _foresee(surface: Geometry, blend: float, radius: float, state: np.ndarray) -> None:
-    """Names the triangle that a free sphere is nearest to, where one is near."""
+def _foresee(surface: Geometry, blend: float, state: np.ndarray) -> None:
+    """Names the triangle that a free sphere is nearest to, however far: it may touch there next."""
     s = state[0]
     near = s.near[0]
     s.nodes[:] = -1
     s.weights[:] = 0.0
-    gather(surface, blend, s.position, _FORESIGHT * radius, 1, s.near)
+    gather(surface, blend, s.position, np.inf, 1, s.near)
     if near.count == 0 or near.distance[near.order[0]] <= 1e-12:
         return
     slot = near.order[0]

@@ -67,14 +67,13 @@ def test_onset_of_contact_does_not_drop_when_the_tissue_answers():
     np.testing.assert_allclose(force, K * depth, atol=0.02 * K * 5e-3)
 
 
-def test_a_tool_that_is_near_names_the_triangle_that_it_would_touch():
+@pytest.mark.parametrize('height', [5e-3, 0.02, 0.5])
+def test_a_free_tool_names_the_triangle_that_it_would_touch_however_far(height):
     rig = Rig()
-    rig.run([RADIUS + 5e-3])
+    rig.run([RADIUS + height])
     assert rig.contact('state') == (NONE,)
     assert sum(rig.contact('weights')) == pytest.approx(1)
     np.testing.assert_allclose(rig.contact('normal'), [0, 0, 1])
-    rig.run([RADIUS + 0.02])
-    assert not any(rig.contact('weights'))
 
 
 @pytest.mark.parametrize('forces', ['one', 'two'])
@@ -86,11 +85,22 @@ def test_one_force_is_the_proxys_and_two_are_the_tissues(forces):
     assert force == pytest.approx((K / 2 if forces == 'one' else K) * 5e-3, rel=1e-6)
 
 
-def test_the_very_first_contact_is_felt_through_the_coupling():
+def test_a_tissue_that_has_said_nothing_of_itself_is_felt_by_a_tenth_of_the_devices_force():
     rig = Rig()
     rig.run(np.full(40, RADIUS + 1e-3))
     rig.sim = False
-    assert rig.run(np.full(5, RADIUS - 2e-3))[-1, 2] == pytest.approx(200.0 * 2e-3)
+    for depth, force in ((1e-3, 200.0 * 1e-3), (5e-3, 0.1 * PROFILE.max_force)):
+        assert rig.run(np.full(5, RADIUS - depth))[-1, 2] == pytest.approx(force)
+
+
+def test_a_stiffness_that_arrives_after_the_touch_it_foresaw_counts():
+    rig = Rig()
+    rig.run(np.full(40, RADIUS + 1e-3))
+    rig.near = True
+    late = rig._sample()
+    assert rig.run([RADIUS - 1e-3])[0, 2] == pytest.approx(200.0 * 1e-3)
+    rig._sample, rig.ms = lambda: late, FRAME - 1
+    assert rig.run([RADIUS - 1e-3])[0, 2] == pytest.approx(K * 1e-3)
 
 
 def test_proxy_spring_and_tissue_share_the_depth_by_their_stiffness():
