@@ -45,7 +45,7 @@ def _panel(ax: Any, law: str, controlled: bool, results: dict[Cell, Outcome]) ->
     codes = np.array(
         [
             [
-                _code(results[Cell(law, controlled, hand, tissue, delay, loss)])
+                _code(results[Cell(law, hand, tissue, delay, loss, controlled)])
                 for delay in DELAYS
                 for loss in LOSSES
             ]

@@ -1,14 +1,14 @@
 """Where the hand can hold the tool still: the command `trainer haptics-stability`.
 
 An emulated arm with a hand on it presses a block of tissue through the whole force path, in a
-closed loop in one process, with delay and loss between force path and tissue. A cell of the map is
-one such run.
+closed loop in one process, with delay, jitter and loss between force path and tissue. A cell of the
+map is the worst of a few such runs.
 """
 
 import csv
 import itertools
 import os
-from dataclasses import astuple, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -32,13 +32,16 @@ from tissue_sim.mesh_io import load_mesh
 from tissue_sim.simulation import TissueSimulation
 
 LAWS = ('constant', 'time', 'position', 'local_stiffness')
-HANDS = (50.0, 200.0, 1000.0)
+HANDS = (30.0, 100.0, 300.0, 1000.0)
 """[N/m] limp to stiff."""
-TISSUES = (50.0, 200.0, 1000.0)
+TISSUES = (50.0, 150.0, 400.0, 1000.0)
 """[N/m] of a point of the tissue, before the coupling spring."""
-DELAYS = (0.0, 0.025, 0.05, 0.1)
+DELAYS = (0.0, 0.01, 0.025, 0.05, 0.075, 0.1)
 """[s] each way."""
-LOSSES = (0.0, 0.05, 0.2)
+LOSSES = (0.0, 0.05, 0.1, 0.2)
+JITTER = 0.2
+"""Largest lateness beyond the delay, as a part of it."""
+SEEDS = (1, 2, 3)
 STILL = 3e-4
 """[m] from peak to peak that a held tool may move at the end of a rest."""
 RADIUS = 0.004
@@ -51,17 +54,18 @@ _YOUNG_BY_STIFFNESS = 1000.0 / 88.0
 """[1/m] Young's modulus of the block over the stiffness of the pressed point."""
 _REST_ENDS = (1.2, 2.3)
 _WATCHED = 0.3
+_BEFORE = 0.1
+"""[s] and the way forth and back: the tool sets out when the tissue has been heard of."""
 _SECONDS = 2.7
 _MOST_DELAY, _MOST_LOSS = 0.05, 0.05
 """Up to which the default must be stable and passive everywhere."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class Place:
     """What is run. Stiffness [N/m], delay [s] each way, loss as a share of the messages."""
 
     law: str
-    controlled: bool
     hand: float
     tissue: float
     delay: float
@@ -69,16 +73,25 @@ class Cell:
 
 
 @dataclass(frozen=True)
+class Cell(Place):
+    """A place without or with the passivity controller."""
+
+    controlled: bool
+
+
+@dataclass(frozen=True)
 class Outcome:
-    """What a run came to.
+    """What the runs of a cell came to.
 
     Attributes:
-        swing: peak to peak of the tool at the end of the rests, the worse of them [m].
+        swing: peak to peak of the tool at the end of the rests, the worst of them [m].
         made: most energy that the motors had given to the hand, net of what they got [J].
+        controller_due: whether a passivity controller had something to do, or would have had.
     """
 
-    swing: float
-    made: float
+    swing: float = 0.0
+    made: float = 0.0
+    controller_due: bool = False
 
     @property
     def stable(self) -> bool:
@@ -90,28 +103,56 @@ class Outcome:
         """The motors gave the hand no more than the credit that the force path has."""
         return self.made <= ENERGY_CREDIT
 
+    def worse(self, other: 'Outcome') -> 'Outcome':
+        """The worse of two, figure by figure."""
+        return Outcome(
+            max(self.swing, other.swing),
+            max(self.made, other.made),
+            self.controller_due or other.controller_due,
+        )
 
-def cells(laws: tuple[str, ...] = LAWS) -> list[Cell]:
+
+def places(laws: tuple[str, ...] = LAWS) -> list[Place]:
     """The whole map."""
-    axes = (laws, (False, True), HANDS, TISSUES, DELAYS, LOSSES)
-    return [Cell(*values) for values in itertools.product(*axes)]
+    axes = (laws, HANDS, TISSUES, DELAYS, LOSSES)
+    return [Place(*values) for values in itertools.product(*axes)]
 
 
-def run_cell(cell: Cell) -> Outcome:
+def run_place(place: Place) -> dict[Cell, Outcome]:
+    """The worst of all seeds, without the passivity controller and with it.
+
+    A cell is done with the first seed that is not stable. Where the observer of a run without the
+    controller calls for nothing, the run with it is the same.
+    """
+    bare, controlled = Outcome(), Outcome()
+    for seed in SEEDS if place.delay or place.loss else SEEDS[:1]:
+        run = run_once(place, False, seed) if bare.stable or controlled.stable else None
+        if run is None:
+            break
+        if controlled.stable:
+            due = run.controller_due
+            controlled = controlled.worse(run_once(place, True, seed) if due else run)
+        bare = bare.worse(run) if bare.stable else bare
+    values = asdict(place)
+    return {Cell(**values, controlled=c): o for c, o in ((False, bare), (True, controlled))}
+
+
+def run_once(place: Place, controlled: bool, seed: int) -> Outcome:
     """Presses, rests, lets go, presses again, rests, and leaves."""
     device = DeviceSettings()
     haptics = HapticsSettings.model_validate(
-        {'extrapolation': cell.law, 'soft_start': 0.0}
-        | ({} if cell.controlled else {'max_damping': 0.0})
+        {'extrapolation': place.law, 'soft_start': 0.0}
+        | ({} if controlled else {'max_damping': 0.0})
     )
     tool = ToolSettings(radius=RADIUS, coupling_stiffness=COUPLING)
     path = ForcePath(tool, device, haptics, device.load_profile())
-    link = LinkSettings(delay=cell.delay, loss=cell.loss, seed=1)
-    session = InProcess(path, Tissue(_block(cell.tissue)), 30.0, link)
-    arm = _arm(cell.hand, device)
+    link = LinkSettings(place.delay, place.loss, JITTER * place.delay, seed=seed)
+    session = InProcess(path, Tissue(block(place.tissue)), 30.0, link)
+    arm = _arm(place.hand, device)
+    session.wait(_BEFORE + 2 * place.delay, arm.position)
     arm.script_running = True
     heights = np.empty(round(_SECONDS / TICK))
-    given = most = 0.0
+    given = most = least = 0.0
     for i in range(len(heights)):
         wrench = session.tick(arm.position, arm.orientation).wrench
         before = arm.true_position.copy()
@@ -120,11 +161,17 @@ def run_cell(cell: Cell) -> Outcome:
         arm.advance(now, enabled=True)
         given += float(arm.force @ (arm.true_position - before))
         most = max(most, given)
+        least = min(least, path.energy)
         heights[i] = arm.true_position[2]
     swings = [
         np.ptp(heights[round((end - _WATCHED) / TICK) : round(end / TICK)]) for end in _REST_ENDS
     ]
-    return Outcome(float(max(swings)), most)
+    return Outcome(float(max(swings)), most, least < -ENERGY_CREDIT)
+
+
+def tip_over(device: DeviceSettings, height: float) -> np.ndarray:
+    """Device position of a tip at a height over the touch [m], shape (3,)."""
+    return device.tissue_from_device.to_device(np.array([*_PLACE, _TOP + RADIUS + height]))
 
 
 def _arm(stiffness: float, device: DeviceSettings) -> EmulatedArm:
@@ -143,7 +190,8 @@ def _arm(stiffness: float, device: DeviceSettings) -> EmulatedArm:
     return EmulatedArm(settings, Hand(settings.hand, compiled))
 
 
-def _block(stiffness: float) -> TissueSimulation:
+def block(stiffness: float) -> TissueSimulation:
+    """A block of which the pressed point has a stiffness [N/m]."""
     nodes, tetrahedra = load_mesh(SCENES.parent / 'meshes' / 'block_yi2007.msh', 1.0)
     return TissueSimulation(
         TetMesh(nodes, tetrahedra, nodes[:, 2] < 1e-6),
@@ -170,13 +218,12 @@ def run_stability(folder: Path, laws: tuple[str, ...] = LAWS) -> list[str]:
 
     if not folder.is_dir():
         raise SessionError(f'{folder} is no folder: make it first, the map goes into it')
-    console, todo = Console(highlight=False), cells(laws)
-    outcomes: list[Outcome] = []
+    console, todo = Console(highlight=False), places(laws)
+    results: dict[Cell, Outcome] = {}
     with console.status('') as line, get_context('spawn').Pool(os.cpu_count() or 1) as pool:
-        for outcome in pool.imap(run_cell, todo, chunksize=4):
-            outcomes.append(outcome)
-            line.update(f'{len(outcomes)} of {len(todo)} runs')
-    results = dict(zip(todo, outcomes, strict=True))
+        for done in pool.imap(run_place, todo, chunksize=4):
+            results.update(done)
+            line.update(f'{len(results)} of {2 * len(todo)} cells')
     write_map(folder / 'haptics-stability.csv', results)
     draw_stability(folder / 'images' / 'haptics-stability.png', results)
     console.print(f'{folder / "haptics-stability.csv"} has {len(results)} rows')
@@ -198,7 +245,7 @@ def broken(results: dict[Cell, Outcome]) -> list[str]:
 
 
 def write_map(file: Path, results: dict[Cell, Outcome]) -> None:
-    """Writes every run as a row."""
+    """Writes every cell as a row."""
     with file.open('w', newline='', encoding='utf-8') as out:
         rows = csv.writer(out, lineterminator='\n')
         names = [field.name for field in fields(Cell)]

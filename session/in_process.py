@@ -35,28 +35,36 @@ class LinkSettings:
     Attributes:
         delay: [s] of each direction.
         loss: share of the messages that never arrive, each direction.
+        jitter: [s] by which a message may be later than that, evenly spread.
         compute: [s] from the beginning of a frame to its answer.
-        seed: of the loss.
+        seed: of loss and jitter.
     """
 
     delay: float = 0.0
     loss: float = 0.0
+    jitter: float = 0.0
     compute: float = 0.010
     seed: int = 0
 
 
 class _Channel:
-    """Hands messages over in order, later, and some of them never."""
+    """Hands messages over in order, later, and some of them never.
 
-    def __init__(self, delay: float, loss: float, random: np.random.Generator) -> None:
-        self._ticks = round(delay / TICK)
-        self._loss = loss
+    A message that is held up holds up those behind it, as a reliable connection does.
+    """
+
+    def __init__(self, link: LinkSettings, delay: float, random: np.random.Generator) -> None:
+        self._delay = delay / TICK
+        self._link = link
         self._random = random
         self._queue: deque[tuple[int, Any]] = deque()
 
     def send(self, tick: int, message: Any) -> None:
-        if self._random.random() >= self._loss:
-            self._queue.append((tick + self._ticks, message))
+        link = self._link
+        if link.loss and self._random.random() < link.loss:
+            return
+        late = link.jitter / TICK * self._random.random() if link.jitter else 0.0
+        self._queue.append((tick + round(self._delay + late), message))
 
     def arrived(self, tick: int) -> list[Any]:
         messages = []
@@ -153,8 +161,8 @@ class InProcess:
         self.frame: Frame | None = None
         self.ticks = 0
         self._rate = rate
-        self._up = _Channel(link.delay, link.loss, random)
-        self._down = _Channel(link.delay + link.compute, link.loss, random)
+        self._up = _Channel(link, link.delay, random)
+        self._down = _Channel(link, link.delay + link.compute, random)
         self._frames = 0
         self._newest: tuple[int, tuple[float, ...]] | None = None
         self._latest: Surface | None = None
@@ -187,6 +195,11 @@ class InProcess:
         if self.ticks * TICK * self._rate >= self._frames + 1 - 1e-9:
             self._simulate()
         return out
+
+    def wait(self, seconds: float, position: np.ndarray) -> None:
+        """Lets time [s] pass with the device at rest at a position [m]."""
+        for _ in range(round(seconds / TICK)):
+            self.tick(position)
 
     def _simulate(self) -> None:
         self._frames += 1
