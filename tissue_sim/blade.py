@@ -21,6 +21,9 @@ _LEAST_AREA = 1e-8
 _AHEAD = 1e-4
 """[m] ahead of the edge, where it is asked whether the tissue is cut."""
 _MOST_STEPS = 32
+_MOST_SLIPS = 8
+_SETTLED = 1.01
+"""Force over resistance at which the blade is taken to rest."""
 
 
 @dataclass(frozen=True)
@@ -131,10 +134,16 @@ class Blade:
         self._edge = root - tip
         if self._element == 0.0:
             self._element = 2 * float(np.cbrt(np.median(mesh.volumes())))
-        nodes, weights, count = self._immerse(mesh, positions)
-        self.immersed = count / _SAMPLES * float(np.linalg.norm(self._edge))
         start = self._device_tip
         self._device_tip = tip.copy()
+        nodes, weights, count = self._immerse(mesh, positions)
+        if count == 0:
+            # Nothing holds it: it goes with the device, in this very frame.
+            self._tip = tip.copy()
+            start = tip
+            self._fracture.forget()
+            nodes, weights, count = self._immerse(mesh, positions)
+        self.immersed = count / _SAMPLES * float(np.linalg.norm(self._edge))
         if count > 0:
             ends = np.concatenate([self._points, self._points + tip - self._tip])
             self._cuts = self._fracture.near(mesh, positions, ends)
@@ -215,7 +224,7 @@ class Blade:
         uncut = self.immersed * fresh / max(count, 1)
         return self._resistance.force(self.immersed, uncut, self._edge, pull), fresh > 0
 
-    def yield_after(self, positions: np.ndarray) -> None:
+    def yield_after(self, mesh: TetMesh, positions: np.ndarray) -> None:
         """Carries the edge with the tissue; lets it slip where the spring exceeds the resistance.
 
         Args:
@@ -230,15 +239,20 @@ class Blade:
         self._tip = self._tip + carried
         self._cut_tip = self._cut_tip + carried
         self._fracture.carry(carried)
-        pull = self._device_tip - self._tip
-        limit, cuts = self._resist(pull)
-        force = spring.stiffness * float(np.linalg.norm(pull))
-        if not cuts or force <= limit:
-            return
-        before = self._tip
-        self._tip = before + pull * (1 - limit / force)
-        edges = np.array([[at + self._edge, at] for at in (before, self._tip)])
-        self._fracture.add(*edges)
+        for _ in range(_MOST_SLIPS):
+            pull = self._device_tip - self._tip
+            limit, cuts = self._resist(pull)
+            force = spring.stiffness * float(np.linalg.norm(pull))
+            if not cuts or force <= _SETTLED * limit:
+                return
+            before = self._tip
+            self._tip = before + pull * (1 - limit / force)
+            edges = np.array([[at + self._edge, at] for at in (before, self._tip)])
+            self._fracture.add(*edges)
+            *_, count = self._immerse(mesh, positions)
+            self.immersed = count / _SAMPLES * float(np.linalg.norm(self._edge))
+            if count == 0:
+                return
 
     def sweep(self) -> Sweep | None:
         """What the edge has swept since `swept` was last called; None: next to nothing."""

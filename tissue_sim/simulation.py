@@ -180,7 +180,7 @@ class TissueSimulation:
                 if pressed >= self._resistance.threshold:
                     self._let_in(contact, coupling)
             return self._next_finish(), None
-        self._blade.yield_after(self.positions)
+        self._blade.yield_after(self.mesh, self.positions)
         if contact is not None and (contact.state == State.NONE or self._clear(contact)):
             self._let_go()
             return self._next_finish(), None
@@ -237,7 +237,8 @@ class TissueSimulation:
     def _stiffness(self, coupling: Coupling, contact: ToolContact | None) -> np.ndarray:
         """Of tissue and coupling spring in series [N/m], shape (3, 3).
 
-        A tool that comes near is told already: the first touch is then felt as stiff as the rest.
+        A tool that touches nothing is told what it would meet: the first touch is then felt as
+        stiff as the rest, however late the answer to it comes.
         """
         spring = coupling
         if spring.mode == FREE:
