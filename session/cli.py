@@ -270,7 +270,7 @@ def haptics_accuracy(
 @app.command('haptics-stability', epilog=EXIT_STATUSES)
 def haptics_stability(
     output: Annotated[
-        Path, typer.Option('--output', '-o', help='Folder for the table and the picture.')
+        Path, typer.Option('--output', '-o', help='Folder with haptics.md, for table and picture.')
     ] = Path('docs'),
 ) -> None:
     """Map where the tool can be held still, by hand, tissue, delay and loss."""

@@ -23,6 +23,7 @@ from haptic_bridge.settings import HapticsSettings
 from haptic_bridge.surface import Surface
 from session.errors import SessionError
 from session.in_process import TICK, InProcess, LinkSettings, Tissue
+from session.marked_page import page_in, put_table
 from session.scene import Scene, load_scene
 from tissue_sim.blade import Resistance
 from tissue_sim.contact import State, ToolContact
@@ -39,7 +40,7 @@ PLACES = ((-0.020, 0.018), (0.0, 0.0))
 """Where the liver is palpated: x and y [m]."""
 FRAME_RATE = 30.0
 _ENCODER = 2e-5
-_LEAD = 0.5
+LEAD = 0.5
 """[s] of the way down, which does not count."""
 
 
@@ -76,7 +77,9 @@ class Row:
     jump_of_1_khz: float
 
 
-def _wave(hertz: float, least: float, most: float) -> Callable[[Floats], tuple[Floats, Floats]]:
+def wave(hertz: float, least: float, most: float) -> Callable[[Floats], tuple[Floats, Floats]]:
+    """Up and down between two depths [m], see `Motion.path`."""
+
     def path(t: Floats) -> tuple[Floats, Floats]:
         return -(least + (most - least) * (0.5 - 0.5 * np.cos(2 * np.pi * hertz * t))), 0 * t
 
@@ -96,13 +99,13 @@ def _cut(t: Floats) -> tuple[Floats, Floats]:
 
 
 MOTIONS = (
-    Motion('palpation 0.5 Hz', _wave(0.5, 0.001, 0.006), 2.0, bar=7.0),
-    Motion('palpation 1 Hz', _wave(1.0, 0.001, 0.006), 2.0, bar=7.0),
-    Motion('palpation 2 Hz', _wave(2.0, 0.001, 0.006), 1.0, bar=10.0),
+    Motion('palpation 0.5 Hz', wave(0.5, 0.001, 0.006), 2.0, bar=7.0),
+    Motion('palpation 1 Hz', wave(1.0, 0.001, 0.006), 2.0, bar=7.0),
+    Motion('palpation 2 Hz', wave(2.0, 0.001, 0.006), 1.0, bar=10.0),
     Motion('sliding 1 Hz', _slide(1.0, 0.005, 0.005), 2.0, bar=7.0),
     Motion('sliding 2 Hz', _slide(2.0, 0.005, 0.005), 1.0, bar=10.0),
-    Motion('tapping 1 Hz', _wave(1.0, -0.003, 0.005), 2.0),
-    Motion('tapping 2 Hz', _wave(2.0, -0.003, 0.005), 1.0),
+    Motion('tapping 1 Hz', wave(1.0, -0.003, 0.005), 2.0),
+    Motion('tapping 2 Hz', wave(2.0, -0.003, 0.005), 1.0),
     Motion('cutting', _cut, 3.8, cuts=True),
 )
 
@@ -138,10 +141,10 @@ class Bench:
 
     def path(self, motion: Motion, place: tuple[float, float]) -> Floats:
         """Tips by tick [m], shape (k, 3): down to where the motion begins, and through it."""
-        t = np.arange(round((_LEAD + motion.seconds) / TICK)) * TICK
-        part = np.clip(t / _LEAD, 0, 1)
+        t = np.arange(round((LEAD + motion.seconds) / TICK)) * TICK
+        part = np.clip(t / LEAD, 0, 1)
         part = part**3 * (10 - 15 * part + 6 * part * part)
-        height, along = motion.path(np.maximum(t - _LEAD, 0.0))
+        height, along = motion.path(np.maximum(t - LEAD, 0.0))
         height = (1 - part) * 0.002 + part * height
         top = self._touch(place)
         x, y = place
@@ -227,18 +230,32 @@ def _surface(simulation: TissueSimulation, previous: Surface | None) -> Surface:
 def compare(name: str) -> list[Row]:
     """A motion, by its name in `MOTIONS`, at all places by all laws."""
     motion = next(motion for motion in MOTIONS if motion.name == name)
-    bench = Bench(load_scene('liver'))
-    paths = [bench.path(motion, place) for place in PLACES]
+    return measure(Bench(load_scene('liver')), motion)
+
+
+def measure(
+    bench: Bench,
+    motion: Motion,
+    *,
+    places: tuple[tuple[float, float], ...] = PLACES,
+    laws: tuple[str, ...] = LAWS,
+) -> list[Row]:
+    """A motion at some places by some laws."""
+    paths = [bench.path(motion, place) for place in places]
     truths = [bench.reference(path, motion.cuts) for path in paths]
-    rows = []
-    for law in LAWS:
-        forces = [bench.rendered(path, motion.cuts, extrapolation=law) for path in paths]
-        rows.append(_row(motion, law, truths, forces))
-    return rows
+    return [
+        _row(
+            motion,
+            law,
+            truths,
+            [bench.rendered(path, motion.cuts, extrapolation=law) for path in paths],
+        )
+        for law in laws
+    ]
 
 
 def _row(motion: Motion, law: str, truths: list[Floats], forces: list[Floats]) -> Row:
-    skip = round(_LEAD / TICK)
+    skip = round(LEAD / TICK)
     peaks = [float(np.linalg.norm(t, axis=1).max()) for t in truths]
     errors = np.concatenate(
         [
@@ -263,53 +280,6 @@ def _jump(forces: Floats, skip: int) -> float:
     return float(np.linalg.norm(np.diff(forces, axis=0), axis=1)[skip:].max())
 
 
-@dataclass(frozen=True)
-class Energy:
-    """What the hand puts in over tapping at 1 Hz, net.
-
-    Attributes:
-        name: of the force.
-        trace: by tick [J], shape (k,).
-        by_cycle: mean of a cycle [J]; negative: the hand got more than it gave.
-        stored: most in a cycle [J].
-    """
-
-    name: str
-    trace: Floats
-    by_cycle: float
-    stored: float
-
-
-def energies() -> list[Energy]:
-    """Of the 1 kHz simulation, of two forces and of one, without and with delay."""
-    bench = Bench(load_scene('liver'))
-    motion = Motion('tapping', _wave(1.0, -0.003, 0.005), 3.0)
-    path = bench.path(motion, PLACES[0])
-    late = LinkSettings(delay=0.05)
-    forces = {'tissue at 1 kHz': bench.reference(path, cuts=False)}
-    for name, link in (('', None), (', 50 ms each way', late)):
-        for kind in ('two', 'one'):
-            forces[f'{kind} force{"s" * (kind == "two")}{name}'] = bench.rendered(
-                path, False, link, forces=kind, max_damping=0.0
-            )
-    held = bench.rendered(path, False, extrapolation='constant', max_damping=0.0)
-    forces['two forces, held (constant)'] = held
-    return [_energy(name, path, force) for name, force in forces.items()]
-
-
-def _energy(name: str, path: Floats, force: Floats) -> Energy:
-    moved = np.diff(path, axis=0)
-    trace = np.concatenate([[0.0], np.cumsum(-np.einsum('ij,ij->i', force[:-1], moved))])
-    cycle, skip = round(1 / TICK), round(_LEAD / TICK)
-    cycles = (len(path) - skip) // cycle
-    ends = trace[skip : skip + cycles * cycle + 1 : cycle]
-    if len(ends) <= cycles:
-        ends = np.append(ends, trace[-1])
-    return Energy(
-        name, trace, float(np.diff(ends).mean()), float(np.ptp(trace[skip : skip + cycle]))
-    )
-
-
 def run_accuracy(folder: Path) -> list[str]:
     """Runs all; writes the table, the picture of the energies, and the table in haptics.md.
 
@@ -322,11 +292,10 @@ def run_accuracy(folder: Path) -> list[str]:
     Raises:
         SessionError: there is no such page.
     """
+    from session.haptics_energy import energies, energies_table
     from session.haptics_pictures import draw_energies
 
-    page = folder / 'haptics.md'
-    if not page.is_file():
-        raise SessionError(f'{page} is not there: the tables go into it')
+    page = page_in(folder, 'haptics.md')
     console = Console(highlight=False)
     rows: list[Row] = []
     with console.status('') as line, get_context('spawn').Pool(os.cpu_count() or 1) as pool:
@@ -341,9 +310,8 @@ def run_accuracy(folder: Path) -> list[str]:
         for row in rows:
             table.writerow([x if isinstance(x, str) else f'{x:.4g}' for x in astuple(row)])
     draw_energies(folder / 'images' / 'haptics-energy.png', budget)
-    text = page.read_text(encoding='utf-8')
-    text = _between(text, 'errors', _errors_table(rows))
-    page.write_text(_between(text, 'energies', _energies_table(budget)), encoding='utf-8')
+    put_table(page, 'errors', _errors_table(rows))
+    put_table(page, 'energies', energies_table(budget))
     console.print(f'{page} has {len(rows)} rows of errors')
     return missed(rows)
 
@@ -359,7 +327,7 @@ def missed(rows: list[Row]) -> list[str]:
     ]
 
 
-def _errors_table(rows: list[Row]) -> str:
+def _errors_table(rows: list[Row]) -> list[str]:
     lines = [
         '| motion | extrapolation | median | p95 | worst | largest jump |',
         '|---|---|---:|---:|---:|---:|',
@@ -368,24 +336,4 @@ def _errors_table(rows: list[Row]) -> str:
         cells = (row.median, row.p95, row.worst, row.largest_jump)
         numbers = ' | '.join(f'{cell:.1f}' for cell in cells)
         lines.append(f'| {row.motion} | `{row.law}` | {numbers} |')
-    return '\n'.join(lines)
-
-
-def _energies_table(budget: list[Energy]) -> str:
-    lines = ['| force | stored by a tap | net by cycle |', '|---|---:|---:|']
-    for e in budget:
-        share = 100 * e.by_cycle / e.stored
-        what = 'lost' if share >= 0 else 'made'
-        lines.append(f'| {e.name} | {1e3 * e.stored:.2f} mJ | {abs(share):.1f} % {what} |')
-    return '\n'.join(lines)
-
-
-def _between(text: str, name: str, table: str) -> str:
-    """The text with what stands between two marks replaced."""
-    start, end = f'<!-- {name} -->', f'<!-- end of {name} -->'
-    if start not in text or end not in text:
-        raise SessionError(
-            f'haptics.md has no marks {start} and {end}: the table goes between them'
-        )
-    before, after = text.split(start)[0], text.split(end)[1]
-    return f'{before}{start}\n\n{table}\n\n{end}{after}'
+    return lines

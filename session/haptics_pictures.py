@@ -9,7 +9,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from session.haptics_accuracy import Energy
+from session.haptics_energy import Energy
 from session.haptics_stability import DELAYS, HANDS, LOSSES, TISSUES, Cell, Outcome
 from session.in_process import TICK
 

@@ -21,8 +21,8 @@ from haptic_bridge.arm_settings import ArmSettings
 from haptic_bridge.force_path import ENERGY_CREDIT, ForcePath
 from haptic_bridge.hand import Hand, compile_script
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
-from session.errors import SessionError
 from session.in_process import TICK, InProcess, LinkSettings, Tissue
+from session.marked_page import page_in, put_table
 from session.scene import SCENES
 from tissue_sim.blade import Resistance
 from tissue_sim.dynamics import TimeStepping
@@ -202,32 +202,65 @@ def block(stiffness: float) -> TissueSimulation:
 
 
 def run_stability(folder: Path, laws: tuple[str, ...] = LAWS) -> list[str]:
-    """Runs the map; writes the table and the pictures to a folder.
+    """Runs the map; writes all cells, the picture, and the table in haptics.md.
 
     Args:
-        folder: that exists.
+        folder: that exists and has haptics.md.
         laws: of extrapolation.
 
     Returns:
         What the default does not keep, in sentences.
 
     Raises:
-        SessionError: the folder does not exist.
+        SessionError: there is no such page.
     """
-    from session.haptics_pictures import draw_stability
-
-    if not folder.is_dir():
-        raise SessionError(f'{folder} is no folder: make it first, the map goes into it')
+    page_in(folder, 'haptics.md')  # before the long way
     console, todo = Console(highlight=False), places(laws)
     results: dict[Cell, Outcome] = {}
     with console.status('') as line, get_context('spawn').Pool(os.cpu_count() or 1) as pool:
         for done in pool.imap(run_place, todo, chunksize=4):
             results.update(done)
             line.update(f'{len(results)} of {2 * len(todo)} cells')
-    write_map(folder / 'haptics-stability.csv', results)
-    draw_stability(folder / 'images' / 'haptics-stability.png', results)
+    publish(folder, results)
     console.print(f'{folder / "haptics-stability.csv"} has {len(results)} rows')
     return broken(results)
+
+
+def publish(folder: Path, results: dict[Cell, Outcome]) -> None:
+    """Writes all cells, the picture, and the table in haptics.md."""
+    from session.haptics_pictures import draw_stability
+
+    write_map(folder / 'haptics-stability.csv', results)
+    draw_stability(folder / 'images' / 'haptics-stability.png', results)
+    put_table(page_in(folder, 'haptics.md'), 'stability', _table(results))
+
+
+def _table(results: dict[Cell, Outcome]) -> list[str]:
+    lines = [
+        '| law | controller | stable | stable and passive | both, up to 50 ms and 5 % |',
+        '|---|---|---:|---:|---:|',
+    ]
+    for law in dict.fromkeys(cell.law for cell in results):
+        for controlled in (False, True):
+            all_ = [
+                (cell, o.stable, o.stable and o.passive)
+                for cell, o in results.items()
+                if cell.law == law and cell.controlled == controlled
+            ]
+            bound = [both for cell, _, both in all_ if _is_bound(cell)]
+            counts = (
+                f'{sum(stable for _, stable, _ in all_)} of {len(all_)}',
+                f'{sum(both for *_, both in all_)} of {len(all_)}',
+                f'{sum(bound)} of {len(bound)}',
+            )
+            with_ = 'with' if controlled else 'without'
+            lines.append(f'| `{law}` | {with_} | {" | ".join(counts)} |')
+    return lines
+
+
+def _is_bound(place: Place) -> bool:
+    """Whether the default must be stable and passive there."""
+    return place.delay <= _MOST_DELAY and place.loss <= _MOST_LOSS
 
 
 def broken(results: dict[Cell, Outcome]) -> list[str]:
@@ -238,8 +271,7 @@ def broken(results: dict[Cell, Outcome]) -> list[str]:
         for cell, out in results.items()
         if cell.law == default
         and cell.controlled
-        and cell.delay <= _MOST_DELAY
-        and cell.loss <= _MOST_LOSS
+        and _is_bound(cell)
         and not (out.stable and out.passive)
     ]
 

@@ -23,6 +23,7 @@ PLANE, TOP, BOTTOM = 0.0101, 0.015, 0.006
 TICKS, LOOK = 8, 4
 """Ticks of a frame, and at how many the place of the proxy is looked at."""
 R = 0.004
+UP = np.array([0.0, 0.0, 1.0])
 
 
 class Stage(NamedTuple):
@@ -41,7 +42,7 @@ class Stage(NamedTuple):
 
 
 def openings(mesh: TetMesh, front: float) -> np.ndarray:
-    """Away from the plane of the cut, most at the top, nothing at the tip and ahead of the front."""
+    """Away from the plane of the cut, most at the top, not at the tip nor ahead of the front."""
     corners, count = mesh.tetrahedra.ravel(), mesh.node_count
     off = np.repeat(mesh.rest[mesh.tetrahedra].mean(axis=1)[:, 1] - PLANE, 4)
     side = np.bincount(corners, off, count) / np.bincount(corners, minlength=count)
@@ -151,7 +152,7 @@ def test_a_cut_that_does_not_open_is_not_felt(cut):
             stage.rest, stage.triangles, revision=revision, topology=topology, previous=surface
         )
         for height in (0.01, 0.0) if revision == 0 else (0.0,):
-            touch = proxy.step(surface, 1.0, tool + [0, 0, height])
+            touch = proxy.step(surface, 1.0, tool + height * UP)
         np.testing.assert_allclose(touch.position, [*tool[:2], TOP + R], atol=1e-7)
         np.testing.assert_allclose(touch.normal, [0, 0, 1], atol=1e-6)
     for y in np.linspace(0.004, 0.016, 60):
@@ -171,7 +172,7 @@ def test_a_sphere_sinks_between_lips_that_open_as_their_edges_let_it():
     proxy, surface = Proxy(R), Surface(*lips(0.0), revision=0, topology=0)
     tool = np.array([0.0, 0.001, R - 0.004])
     for height in (0.01, 0.0):
-        proxy.step(surface, 1.0, tool + [0, 0, height])
+        proxy.step(surface, 1.0, tool + height * UP)
     gaps = np.linspace(0.0, 1.6 * R, 9)
     for revision, (before, after) in enumerate(pairwise(gaps), start=1):
         surface = Surface(*lips(after), revision=revision, topology=0, previous=surface)
@@ -228,7 +229,7 @@ def test_a_piece_that_vanishes_under_the_sphere_lets_it_nearer_and_never_into_th
     for height in (0.01, 0.0):
         mesh = TetMesh(nodes, tetrahedra)
         surface = Surface(mesh.rest, mesh.triangles, revision=0, topology=0)
-        depth = proxy.step(surface, 1.0, tool + [0, 0, height]).depth
+        depth = proxy.step(surface, 1.0, tool + height * UP).depth
     assert depth == pytest.approx(0.006)
     for topology in range(1, 12):
         middles = nodes[tetrahedra].mean(axis=1)

@@ -240,6 +240,10 @@ class Blade:
         self._cut_tip = self._cut_tip + carried
         self._fracture.carry(carried)
         for _ in range(_MOST_SLIPS):
+            *_, count = self._immerse(mesh, positions)
+            self.immersed = count / _SAMPLES * float(np.linalg.norm(self._edge))
+            if count == 0:
+                return
             pull = self._device_tip - self._tip
             limit, cuts = self._resist(pull)
             force = spring.stiffness * float(np.linalg.norm(pull))
@@ -249,10 +253,6 @@ class Blade:
             self._tip = before + pull * (1 - limit / force)
             edges = np.array([[at + self._edge, at] for at in (before, self._tip)])
             self._fracture.add(*edges)
-            *_, count = self._immerse(mesh, positions)
-            self.immersed = count / _SAMPLES * float(np.linalg.norm(self._edge))
-            if count == 0:
-                return
 
     def sweep(self) -> Sweep | None:
         """What the edge has swept since `swept` was last called; None: next to nothing."""
