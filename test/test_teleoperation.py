@@ -39,9 +39,8 @@ def test_a_first_touch_that_the_tissue_has_not_answered_yet_is_no_harder_than_th
     tissue: float,
 ) -> None:
     force = pressed(tissue, LinkSettings(delay=0.05), start=0.03)
-    assert force[-1] > 0.15
-    # A load on a node sinks deeper than one between nodes, by up to half.
-    assert force.max() < 1.5 * force[-1]
+    assert 0.15 < force[-1] < 3.0
+    assert force.max() < 1.1 * force[-1]
 
 
 @pytest.mark.parametrize(('hand', 'tissue'), [(30.0, 1000.0), (1000.0, 50.0), (1000.0, 1000.0)])
