@@ -19,6 +19,7 @@ from cutting.settings import CuttingSettings
 from session.stability_report import highest_mode, measured_limit
 from tissue_sim.blade import Resistance, Sweep
 from tissue_sim.budget import Budget
+from tissue_sim.candidate import Task
 from tissue_sim.contact import press_triangle
 from tissue_sim.coupling import Coupling
 from tissue_sim.dynamics import TimeStepping
@@ -26,7 +27,6 @@ from tissue_sim.elasticity import ElasticModel
 from tissue_sim.integrators import Integrator, IntegratorName
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
-from tissue_sim.plan import Task
 from tissue_sim.simulation import TissueSimulation
 from tissue_sim.topology import CUT
 

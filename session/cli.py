@@ -235,11 +235,14 @@ def plan(
     scene: Annotated[
         str, typer.Argument(help='Name of a scene in config/scenes, or path of a scene file.')
     ],
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the plan as JSON on standard output.')
+    ] = False,
 ) -> None:
     """Find the least method that meets a scene's budget, and say why not a lesser one."""
     from session.plan_report import run_plan
 
-    raise typer.Exit(int(run_plan(scene)))
+    raise typer.Exit(int(run_plan(scene, as_json=as_json)))
 
 
 @app.command(epilog=EXIT_STATUSES)

@@ -10,10 +10,10 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from session.scene import load_scene
 from tissue_sim.assembly import make_task
+from tissue_sim.candidate import Task
 from tissue_sim.coupling import Coupling
 from tissue_sim.elasticity import MODELS, ElasticModel, ModelName
 from tissue_sim.integrators import INTEGRATORS, Integrator, IntegratorName
-from tissue_sim.plan import Task
 from tissue_sim.stability import FrequencyBound, step_bound
 
 Floats = NDArray[np.float64]

@@ -1,23 +1,33 @@
 """The planner: what it asks of a mesh, what it takes, what it says when nothing fits."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from meshes import box, irregular_box
 
+from bench.plan_check import deep_error, script_presses, settlement_error
+from bench.quadratic import QuadraticTissue
 from session.chart_problems import LargeRotation
-from session.plan_report import report
+from session.plan_report import as_data, report
 from session.scene import load_scene
+from tissue_sim.active_region import ActiveSettings
 from tissue_sim.assembly import make_simulation, make_task
 from tissue_sim.budget import Budget
+from tissue_sim.candidate import Candidate, Cost, Errors
 from tissue_sim.compliance import solve_static
+from tissue_sim.dent import dents
 from tissue_sim.elasticity import ElasticModel
 from tissue_sim.equilibrium import equilibrium
+from tissue_sim.frame_cost import with_regions
+from tissue_sim.hyperelastic import neo_hookean
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
-from tissue_sim.plan import Plan, model_errors, plan, time_error
-from tissue_sim.probe import Probing, places
+from tissue_sim.method_errors import errors_at_rest, time_error
+from tissue_sim.plan import Plan, plan
+from tissue_sim.press import places
+from tissue_sim.probe import Probing, Strains
 from tissue_sim.refine import refined
 
 GEL = Material(5000.0, 0.4, 1000.0, 10.0, 2e-4)
@@ -83,12 +93,52 @@ def test_time_error_is_that_of_a_mass_on_a_spring_moved_at_one_hertz(integrator:
 
 
 def test_a_linear_model_is_charged_with_one_minus_the_cosine() -> None:
-    probing = Probing({False: 0.1, True: 0.05}, 0.02, 30.0)
+    nodes, tets = box((2, 2, 2), 0.01)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    strains = Strains(mesh, GEL, places(mesh, 0.01, 1)[0], 1e-4)
+    probing = Probing({False: 0.1, True: 0.05}, strains, 30.0)
     budget = Budget(rotation=30.0)
-    assert model_errors('linear', probing, budget).rotation == pytest.approx(0.134, abs=1e-3)
-    assert model_errors('corotational', probing, budget).rotation == 0.0
-    smoothed = model_errors('linear_smoothed', probing, budget)
-    assert smoothed.elements < model_errors('linear', probing, budget).elements
+    assert errors_at_rest('linear', probing, budget).rotation == pytest.approx(0.134, abs=1e-3)
+    assert errors_at_rest('corotational', probing, budget).rotation == 0.0
+    smoothed = errors_at_rest('linear_smoothed', probing, budget)
+    assert smoothed.elements < errors_at_rest('linear', probing, budget).elements
+
+
+def test_a_neo_hookean_block_that_is_stretched_and_sheared_has_the_stress_of_its_formula() -> None:
+    lam, mu = 3000.0, 1500.0
+    stretch = np.diag([1.3, 0.9, 0.8])
+    shear = np.eye(3)
+    shear[0, 1] = 0.7
+    angle = 0.9
+    turn = np.eye(3)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    stress, change = neo_hookean(np.array([stretch, shear, turn]), lam, mu)
+    sides = np.diag(stretch)
+    principal = mu * (sides - 1 / sides) + lam * np.log(sides.prod()) / sides
+    np.testing.assert_allclose(stress[0], np.diag(principal), atol=1e-9)
+    # Simple shear keeps the volume: P = mu (F - F^-T), so that the Cauchy shear is mu gamma.
+    np.testing.assert_allclose((stress[1] @ shear.T)[0, 1], mu * 0.7, rtol=1e-12)
+    np.testing.assert_allclose(stress[2], 0.0, atol=1e-9)
+    way, size = np.random.default_rng(3).normal(size=(3, 3)), 1e-6
+    ahead, behind = (neo_hookean((shear + s * way)[None], lam, mu)[0] for s in (size, -size))
+    slope = np.einsum('bpaj,aj->bp', change[1], way)
+    np.testing.assert_allclose((ahead - behind)[0] / (2 * size), slope, rtol=1e-5, atol=1e-3)
+
+
+@pytest.fixture(scope='module')
+def block() -> TetMesh:
+    nodes, tets = box((6, 6, 3), 0.01)
+    return TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+
+
+def test_a_shallow_dent_is_linear_and_a_deep_one_errs_the_more_the_deeper(block: TetMesh) -> None:
+    press = places(block, 0.015, 1)[0]
+    shallow, deep, deeper = (
+        max(d.error(rotating=False) for d in dents(block, GEL, press, depth))
+        for depth in (1e-5, 0.004, 0.008)
+    )
+    assert shallow < 2e-3
+    assert 10 * shallow < deep < deeper
 
 
 @pytest.fixture(scope='module')
@@ -102,9 +152,7 @@ def test_the_palpation_scene_takes_the_linear_model_and_the_flap_a_corotational_
     assert plans['palpation'].chosen is not None and plans['flap'].chosen is not None
     assert plans['palpation'].chosen.model == 'linear'
     assert plans['flap'].chosen.model.startswith('corotational')
-    assert any(s.startswith('linear: 29 % at the 45 degrees') for s in plans['flap'].rejected)
-    text = '\n'.join(report('flap', load_scene('flap').tissue, plans['flap']))
-    assert 'not linear: 29 % at the 45 degrees that this scene allows' in text
+    assert any(str(r).startswith('linear: 29 % at the 45 degrees') for r in plans['flap'].rejected)
 
 
 def test_the_scenes_take_the_model_that_their_plan_finds(plans: dict[str, Plan]) -> None:
@@ -114,13 +162,14 @@ def test_the_scenes_take_the_model_that_their_plan_finds(plans: dict[str, Plan])
 
 
 def test_the_predicted_error_is_not_exceeded_by_quadratic_elements(plans: dict[str, Plan]) -> None:
-    """At places of its own: those of the scene's script."""
-    from bench.plan_check import settlement_error
-
-    found = plans['palpation']
+    """At a place of its own, one of the scene's script, and as deep as the budget says."""
+    found = plans['flap']
     assert found.chosen is not None
-    wrong = settlement_error(found, np.array([[0.02, 0.015, 0.04]]))
-    assert 0.02 < wrong < found.chosen.errors.elements
+    task = found.task
+    presses = script_presses(load_scene('flap'), task)[:1]
+    exact = QuadraticTissue(task.mesh, task.material)
+    assert 0.0 < settlement_error(task, found.chosen, presses, exact) < found.chosen.errors.elements
+    assert 0.0 < deep_error(task, found.chosen, presses, exact) < found.chosen.errors.total
 
 
 def test_where_nothing_fits_what_is_proposed_does() -> None:
@@ -153,3 +202,48 @@ def test_a_scene_that_asks_for_it_runs_by_its_plan() -> None:
     assert simulation.dynamics.stepping.integrator == found.chosen.integrator
     _, none = make_simulation(settings.model_copy(update={'method': 'given'}))
     assert none is None
+
+
+def test_the_report_says_what_is_taken_and_why_nothing_less_and_so_does_the_json(
+    plans: dict[str, Plan],
+) -> None:
+    settings, found = load_scene('flap').tissue, plans['flap']
+    lines = report('flap', settings, found)
+    text = '\n'.join(lines)
+    assert 'asked: up to 12 mm and 45 degrees, error at most 20 %' in text
+    assert 'linear: 29 % at the 45 degrees that this scene allows' in text
+    assert any(line.startswith('taken: corotational_smoothed by ') for line in lines)
+    data = json.loads(json.dumps(as_data('flap', settings, found)))
+    assert data['chosen']['model'] == 'corotational_smoothed'
+    errors = data['chosen']['errors']
+    assert errors['total'] == pytest.approx(
+        errors['elements'] + errors['strain'] + errors['time'] + errors['region']
+    )
+    assert data['chosen']['cost']['frame'] <= data['available']
+    lesser = next(r for r in data['rejected'] if r['method'] == 'linear')
+    assert lesser['fails'] and '45 degrees' in lesser['why']
+
+
+def test_a_scene_whose_own_method_does_not_meet_its_budget_is_told(plans: dict[str, Plan]) -> None:
+    settings = load_scene('flap').tissue.model_copy(update={'model': 'linear'})
+    text = '\n'.join(report('flap', settings, plans['flap']))
+    assert (
+        f'the scene takes linear by {settings.integrator}, which does not meet its budget' in text
+    )
+    assert 'tissue.method: auto would follow the plan' in text
+
+
+def test_a_region_of_few_nodes_makes_a_large_tissue_cheaper_and_its_error_is_counted() -> None:
+    nodes, tets = box((30, 6, 6), 0.005)
+    task = replace(
+        make_task(load_scene('palpation').tissue),
+        mesh=TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
+        budget=Budget(displacement=0.002, contact_radius=0.01),
+    )
+    cost = Cost(20, 1e-3, 0.0, 1e-3)
+    whole = Candidate('corotational_smoothed', 'symplectic_euler', Errors(0.1, 0.0, 0.0), cost)
+    regions = [ActiveSettings('budget', nodes) for nodes in (60, 800)]
+    few, more = with_regions(task, whole, regions)
+    assert few.cost.frame < 0.7 * cost.frame
+    assert few.errors.region > more.errors.region > 0
+    assert few.errors.total == pytest.approx(0.1 + few.errors.region)

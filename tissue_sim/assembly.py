@@ -2,11 +2,12 @@
 
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
+from tissue_sim.candidate import Task
 from tissue_sim.dynamics import TimeStepping
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.mesh_io import load_tissue
-from tissue_sim.plan import Plan, Task, plan
+from tissue_sim.plan import Plan, plan
 from tissue_sim.settings import TissueSettings
 from tissue_sim.simulation import TissueSimulation
 from tissue_sim.warm_up import warm_up
@@ -39,7 +40,7 @@ def make_task(settings: TissueSettings) -> Task:
 def make_simulation(settings: TissueSettings) -> tuple[TissueSimulation, Plan | None]:
     """The simulation that a scene describes, and the plan it goes by if it asks for one.
 
-    Where no method fits the budget, the scene's own model and integrator are taken.
+    Where no method fits the budget, the scene's own model, integrator and active region are taken.
 
     Args:
         settings: its section `tissue`.
@@ -53,15 +54,16 @@ def make_simulation(settings: TissueSettings) -> tuple[TissueSimulation, Plan | 
         warm_up()  # a kernel that is compiled meanwhile would count as cost
         found = plan(task)
     model, stepping = settings.model, task.stepping
+    active = ActiveSettings(**settings.active_region.model_dump())
     if found is not None and found.chosen is not None:
-        model, stepping = found.chosen.model, found.stepping
+        model, stepping, active = found.chosen.model, found.stepping, found.chosen.active
     simulation = TissueSimulation(
         task.mesh,
         task.material,
         task.resistance,
         model=model,
         stepping=stepping,
-        active=ActiveSettings(**settings.active_region.model_dump()),
+        active=active,
         stretch=settings.stretch,
     )
     return simulation, found

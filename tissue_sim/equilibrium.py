@@ -66,7 +66,7 @@ def equilibrium(
         largest = max(largest, size)
         if size <= tolerance * largest:
             return u.reshape(-1, 3)
-        step = _newton_step(residual, u, free, out, _preconditioner(model, u, free), scale)
+        step = _newton_step(residual, u, free, out, preconditioner(model, u, free), scale)
         # Whole steps: on the way round a bend the residual grows before it falls.
         u[free] += step
         out = residual(u)
@@ -93,14 +93,20 @@ def _newton_step(
     count = len(out)
     matrix = LinearOperator((count, count), matvec=tangent, dtype=float)
     with np.errstate(all='ignore'):  # a tissue that gives way shows in the residual
-        step, _ = cg(matrix, out, rtol=_INEXACT, maxiter=2000, M=preconditioner)
+        most = 200 if count <= _FACTORISED else 2000
+        step, _ = cg(matrix, out, rtol=_INEXACT, maxiter=most, M=preconditioner)
     return np.asarray(step)
 
 
-def _preconditioner(model: ElasticModel, u: Floats, free: NDArray[np.bool_]) -> LinearOperator:
+def preconditioner(model: ElasticModel, u: Floats, free: NDArray[np.bool_]) -> LinearOperator:
     """Solves with the plain elements' stiffness under their present rotations, or its diagonal.
 
     A slender part that has turned is where conjugate gradients without it would not end.
+
+    Args:
+        model: whose mesh and material it has.
+        u: displacement by coordinate [m], shape (3 n,).
+        free: True where a coordinate can move, shape (3 n,).
     """
     count = int(free.sum())
     if count > _FACTORISED:
