@@ -16,6 +16,7 @@ from tissue_sim.assembly import make_simulation
 from tissue_sim.contact import Command, Frame, ToolContact
 from tissue_sim.errors import MeshError
 from tissue_sim.mesh import Touched
+from tissue_sim.plan_watch import PlanWatch
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
 from tissue_sim.timing import PeriodicLoop
@@ -36,8 +37,8 @@ class TissueSimNode(Node):
         self.declare_parameter('seed', 0)
         settings = read_section(scene, 'tissue', TissueSettings)
         self._scene = scene.stem
-        self._simulation, self._plan = make_simulation(settings)
-        self._over = ''
+        self._simulation, plan = make_simulation(settings)
+        self._plan = None if plan is None else PlanWatch(plan, self._simulation)
         self._log_plan()
         self._loop = PeriodicLoop(settings.integration.rate)
         self._encoder = messages.DeltaEncoder(self._simulation.mesh, self._simulation.displacement)
@@ -57,26 +58,10 @@ class TissueSimNode(Node):
     def _log_plan(self) -> None:
         if self._plan is None:
             return
-        log = self.get_logger()
-        for sentence in self._plan.rejected:
-            log.info(f'not {sentence}')
-        if self._plan.chosen is None:
-            log.warning(
-                f'no method fits the budget, so {self._simulation.model.name} is taken; to have '
-                f'one: {"; ".join(self._plan.remedies)}'
-            )
-        else:
-            log.info(f'method: {self._plan.chosen.name}')
-
-    def _check_plan(self, frame: Frame) -> None:
-        """Says once after a cut when the plan does not hold for the tissue any more."""
-        if self._plan is None or self._touched is None:
-            return
-        needed = frame.substeps / max(frame.slow_motion, 1e-9)
-        over = self._plan.over(needed, len(self._simulation.mesh.tetrahedra))
-        if over and not self._over:
-            self.get_logger().warning(over)
-        self._over = over
+        for sentence in self._plan.announcement():
+            self.get_logger().info(sentence)
+        if self._plan.unmet:
+            self.get_logger().warning(self._plan.unmet)
 
     def _connect(self) -> None:
         self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, ros.LATCHED)
@@ -105,7 +90,9 @@ class TissueSimNode(Node):
         self._take_answer()
         contact = self._newest_contact()
         frame = self._simulation.frame(contact)
-        self._check_plan(frame)
+        over = self._plan.follow(frame) if self._plan else ''
+        if over:
+            self.get_logger().warning(over, throttle_duration_sec=5.0)
         now = time.time_ns()
         used = None if contact is None else self._contact
         self._inputs.publish(
@@ -227,6 +214,10 @@ class TissueSimNode(Node):
         return response
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
+        with self._lock:  # a cut changes mesh and displacement one after the other
+            return self._status_now()
+
+    def _status_now(self) -> tuple[bytes, str, dict[str, object]]:
         values: dict[str, object] = dict(self._loop.report())
         simulation, frame = self._simulation, self._frame
         values |= {
@@ -239,6 +230,7 @@ class TissueSimNode(Node):
             'active_nodes': simulation.dynamics.active_nodes,
             'inverted': simulation.dynamics.inverted,
         }
+        values |= self._plan.values() if self._plan else {}
         values |= {f'refused {what}': count for what, count in self._rejected.items()}
         if frame is None:
             return DiagnosticStatus.OK, 'starting', values
@@ -247,10 +239,12 @@ class TissueSimNode(Node):
             return DiagnosticStatus.ERROR, f'a frame was taken back: {frame.trouble}', values
         if frame.trouble:
             return DiagnosticStatus.WARN, frame.trouble, values
-        if self._over:
-            return DiagnosticStatus.WARN, self._over, values
+        if self._plan and self._plan.over:
+            return DiagnosticStatus.WARN, self._plan.over, values
         if frame.slow_motion < 0.999:
             return DiagnosticStatus.WARN, 'max_substeps is too small for real time', values
+        if self._plan and self._plan.unmet:
+            return DiagnosticStatus.WARN, self._plan.unmet, values
         return DiagnosticStatus.OK, frame.state.name.lower(), values
 
 

@@ -1,0 +1,202 @@
+"""The running node `tissue_sim` with `method: auto`; the test plays the hand and the cutting."""
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from cutting_trainer_msgs.msg import Contact
+from cutting_trainer_msgs.srv import Cut
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from live import wait_for
+from rclpy.executors import SingleThreadedExecutor
+from ruamel.yaml import YAML
+
+from session.domain import reserved_domain
+from session.graph import node_environment
+from session.scene import load_scene
+from tissue_sim import ros
+from tissue_sim.assembly import make_task
+from tissue_sim.contact import State, ToolContact, press_triangle
+from tissue_sim.mesh import TopologyDelta
+from tissue_sim.messages import delta_into
+
+ROOT = Path(__file__).parents[1]
+DOWN = np.array([0.0, 0.0, -1.0])
+SPLIT = 5
+"""Tetrahedron that the cut splits, close to one of its corners: three slivers and the rest."""
+
+
+def planning_scene(folder: Path, **budget: Any) -> Path:
+    """The block of the thesis, said not to be cut, and no limit to how small elements may be."""
+    scene = YAML(typ='safe').load(ROOT / 'config' / 'scenes' / 'block.yaml')
+    tissue = scene['tissue']
+    tissue |= {'mesh': str(ROOT / 'config/meshes/block_yi2007.msh'), 'method': 'auto'}
+    tissue['damping'] = {'alpha': 10, 'beta': 1e-4}
+    tissue['integration'] |= {'frequency_growth': 1000, 'max_substeps': 3000}
+    tissue['budget'] |= {'cuts': False, **budget}
+    path = folder / 'scene.yaml'
+    with path.open('w') as file:
+        YAML().dump(scene, file)
+    return path
+
+
+class Surroundings:
+    """What stands around the node: contacts at some 50 Hz, the service of cutting, an operator."""
+
+    def __init__(self, context: rclpy.Context, scene: Path) -> None:
+        self.mesh = make_task(load_scene(str(scene)).tissue).mesh
+        self.node = rclpy.create_node('surroundings', context=context)
+        self._contacts = self.node.create_publisher(Contact, ros.CONTACT, ros.STREAM)
+        self.node.create_service(Cut, ros.CUT, self._cut)
+        self.node.create_subscription(
+            DiagnosticArray, ros.DIAGNOSTICS, self._take_status, ros.EVENTS
+        )
+        self._timer = self.node.create_timer(0.02, self._press)
+        self.pressing = False
+        self._sent = 0
+        self.cuts = 0
+        self.status: DiagnosticStatus | None = None
+
+    def values(self) -> dict[str, str]:
+        return {v.key: v.value for v in self.status.values} if self.status else {}
+
+    def _take_status(self, array: DiagnosticArray) -> None:
+        self.status = array.status[0]
+
+    def _press(self) -> None:
+        """The blade goes in, and then along."""
+        if not self.pressing:
+            return
+        self._sent += 1
+        depth = min(0.0004 * self._sent, 0.008)
+        contact = press_triangle(self.mesh, np.array([0.0, 0.0, 0.01]), DOWN, depth)
+        along = np.array([max(0.0005 * (self._sent - 40), 0.0), 0.0, 0.0])
+        self._contacts.publish(self._message(contact, along))
+
+    def _message(self, contact: ToolContact, along: np.ndarray) -> Contact:
+        device = contact.device + along
+        weights = np.zeros(9)
+        weights[:3] = contact.weights
+        return Contact(
+            sequence=self._sent,
+            state=int(State.TOUCHING),
+            topology=0,
+            nodes=np.resize(contact.nodes, 9).astype(np.uint32),
+            weights=weights,
+            device=device,
+            proxy=device,
+            point=device,
+            normal=-DOWN,
+            coupling_stiffness=contact.stiffness,
+            blade_root=contact.blade_root + along,
+            blade_tip=contact.blade_tip + along,
+            proxy_radius=contact.radius,
+        )
+
+    def _cut(self, request: Cut.Request, response: Cut.Response) -> Cut.Response:
+        parents = self.mesh.tetrahedra[SPLIT].astype(np.int64)
+        children = np.tile(parents, (4, 1))
+        children[range(4), range(4)] = self.mesh.node_count
+        split = TopologyDelta(
+            node_parents=parents[None],
+            node_weights=np.array([[0.999, 0.0004, 0.0003, 0.0003]]),
+            removed_tetrahedra=np.array([SPLIT], np.int64),
+            tetrahedra=children,
+            outer_faces=np.array([1, 2, 4, 8], np.uint8),
+        )
+        delta_into(response, split if self.cuts == 0 else TopologyDelta())
+        response.topology = min(self.cuts, 1)
+        response.revision, response.success = request.revision, True
+        self.cuts += 1
+        return response
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    with reserved_domain('free') as domain:
+        yield domain
+
+
+@pytest.fixture
+def run(tmp_path: Path, domain: int) -> Iterator[Any]:
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    executor = SingleThreadedExecutor(context=context)
+    ended = threading.Event()
+
+    def serve() -> None:
+        while not ended.is_set():
+            executor.spin_once(timeout_sec=0.1)
+
+    server = threading.Thread(target=serve)
+    processes, nodes = [], []
+
+    def start(scene: Path) -> tuple[Surroundings, Path]:
+        surroundings = Surroundings(context, scene)
+        nodes.append(surroundings.node)
+        executor.add_node(surroundings.node)
+        server.start()
+        said = tmp_path / 'said'
+        with said.open('wb') as file:
+            process = subprocess.Popen(
+                [sys.executable, '-m', 'tissue_sim.node', '--ros-args', '-p', f'scene:={scene}'],
+                cwd=ROOT,
+                env=node_environment(domain),
+                stdout=file,
+                stderr=subprocess.STDOUT,
+            )
+        processes.append(process)
+        wait_for(lambda: 'ready: tissue_sim' in said.read_text(), 'the node')
+        return surroundings, said
+
+    yield start
+    for process in processes:
+        process.terminate()
+        process.wait()
+    ended.set()
+    server.join()
+    executor.shutdown()
+    for node in nodes:
+        node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_a_node_that_plans_says_what_it_takes_and_warns_when_a_cut_breaks_the_budget(
+    run: Any, tmp_path: Path
+) -> None:
+    surroundings, log = run(planning_scene(tmp_path, cores=0.072))
+    said = log.read_text()
+    assert 'method: linear_smoothed by ' in said
+    assert 'not linear: 103 % by elements of this size; 80 % is allowed' in said
+    wait_for(lambda: 'substeps' in surroundings.values(), 'a frame')
+    values = surroundings.values()
+    assert values['method'].startswith('linear_smoothed by ')
+    assert 0.5 < float(values['predicted_error']) <= 0.8
+    assert 0 < float(values['predicted_frame']) <= float(values['allowed_frame'])
+    assert surroundings.status.level == DiagnosticStatus.OK
+
+    surroundings.pressing = True
+    wait_for(lambda: surroundings.cuts, 'a request to cut')
+    wait_for(lambda: 'after the cut' in surroundings.status.message, 'the warning')
+    assert surroundings.status.level == DiagnosticStatus.WARN
+    wait_for(lambda: 'after the cut linear_smoothed by ' in log.read_text(), 'the warning')
+    assert 'that it may use' in log.read_text()
+
+
+def test_a_node_for_whose_budget_nothing_fits_runs_as_the_scene_says_and_says_so(
+    run: Any, tmp_path: Path
+) -> None:
+    surroundings, log = run(planning_scene(tmp_path, error=0.1))
+    given = load_scene(str(tmp_path / 'scene.yaml')).tissue
+    sentence = f'no method fits the budget, so {given.model} by {given.integrator} is taken'
+    assert sentence in log.read_text()
+    wait_for(lambda: 'substeps' in surroundings.values(), 'a frame')
+    wait_for(lambda: sentence in surroundings.status.message, 'the status')
+    assert surroundings.status.level == DiagnosticStatus.WARN
+    assert 'a mesh with edges' in surroundings.status.message
