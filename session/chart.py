@@ -56,9 +56,7 @@ no other lies below and to the left of it. Those are joined by the grey line. Al
 ## The methods of the scenes
 
 On the panels that are what a scene does, is its method on the front: on no mesh is another one
-faster and as near, and on one of them it is on the front of all? Where a scene's budget allows
-rotations at which linear strain errs by more than 5 %, linear models are no rivals on panels of
-small displacements, which do not show that error.
+faster and as near, and on one of them it is on the front of all?
 
 {front}
 """

@@ -5,23 +5,17 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from session.chart_measure import SAME, Point, with_front
+from session.chart_measure import SAME, Point
 from session.scene import SCENES, load_scene
 from tissue_sim.settings import TissueSettings
 
 PANELS = {
-    'block': ('indentation', 'after_cut', 'large_rotation'),
+    'block': ('indentation', 'after_cut'),
     'flap': ('large_rotation',),
-    'liver': ('indentation', 'after_cut', 'large_rotation'),
+    'liver': ('indentation', 'after_cut'),
     'palpation': ('indentation',),
 }
 """Problems of the chart that are what a scene does."""
-
-_TURNED = 0.05
-"""1 - cos of a scene's largest rotation, above which linear models are no rivals: they err by it,
-and the panels of small displacements do not show it."""
 
 
 def read_points(path: Path) -> list[Point]:
@@ -76,14 +70,8 @@ def scenes() -> dict[str, TissueSettings]:
 
 def standing(points: list[Point], scene: str, tissue: TissueSettings) -> dict[str, list[str]]:
     """By panel, what keeps the method of a scene off the front; nothing: it lies on it."""
-    turned = 1 - np.cos(np.deg2rad(tissue.budget.rotation)) > _TURNED
-    found = {}
-    for problem in PANELS[scene]:
-        panel = [p for p in points if p.problem == problem]
-        if turned and problem != 'large_rotation':
-            panel = with_front([p for p in panel if p.model.startswith('corotational')])
-        found[problem] = beaten(panel, problem, (tissue.model, tissue.integrator))
-    return found
+    method = (tissue.model, tissue.integrator)
+    return {problem: beaten(points, problem, method) for problem in PANELS[scene]}
 
 
 def front_table(points: list[Point]) -> str:
