@@ -77,6 +77,10 @@ class EmulatedArm:
         """Whether commands arrive, by the watchdog's measure."""
         return self._command_ns is not None
 
+    def guide(self, position: np.ndarray, orientation: np.ndarray) -> None:
+        """Takes the hand off its script, towards a pose in the device frame (`Hand.guide`)."""
+        self._hand.guide(position, orientation)
+
     def command(self, stamp_ns: int, force: tuple[float, ...], now_ns: int) -> None:
         """Takes a servo_cf.
 
@@ -141,7 +145,7 @@ class EmulatedArm:
 
     def _move(self) -> None:
         settings, hand, step = self._settings, self._hand, self._step
-        if self.script_running:
+        if self.script_running and not hand.guided:
             self.script_time = min(self.script_time + step, hand.script.seconds)
         hand.move_to(self.script_time, self._age * step)
         _integrate(

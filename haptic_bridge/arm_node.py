@@ -5,9 +5,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.node import Node
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Joy
 
 from haptic_bridge.arm import EmulatedArm
@@ -23,6 +25,8 @@ from haptic_bridge.wire import PoseStampedCodec, TwistStampedCodec, WireError, W
 from tissue_sim.ros import (
     ARM,
     EVENTS,
+    FRAME,
+    HAND,
     LATCHED,
     NEWEST_BEST_EFFORT,
     STREAM,
@@ -49,7 +53,11 @@ class ArmNode(Node):
         seed: of the tremor.
         auto_enable: start in the state ENABLED.
         wait_for_bridge: begin the script when the bridge is ENABLED and commands; else when the
-            arm itself is ENABLED.
+            arm itself is ENABLED. In the state PAUSED it stands still.
+        guided: the hand has no script; it stays at its start until it is given goals.
+
+    A goal for the hand on `arm/hand/servo_cp`, in the tissue frame as the script is, takes the hand off
+    its script for good.
 
     It speaks as the scene's section `device` says (unit, mirrored axis, sign, force frame), so that
     a bridge with the same scene understands it.
@@ -67,14 +75,23 @@ class ArmNode(Node):
         script = compile_script(settings.script, device.tissue_from_device, seconds)
         body_force = device.force_frame == 'body'
         self._convention = DeviceConvention(device)
+        self._frame = device.tissue_from_device
         self._waits = bool(self.declare_parameter('wait_for_bridge', True).value)
+        guided = bool(self.declare_parameter('guided', False).value)
 
         def new_arm() -> EmulatedArm:
             hand = Hand(settings.hand, script, seed)
             return EmulatedArm(settings, hand, body_force=body_force)
 
-        new_arm().advance(0, enabled=False)  # compiles the kernels before the clock runs
+        for guide in (False, True):  # compiles the kernels before the clock runs
+            arm = new_arm()
+            if guide:
+                arm.guide(arm.position, arm.orientation)
+            arm.advance(0, enabled=False)
         self._arm = new_arm()
+        if guided:
+            self._arm.guide(self._arm.position, self._arm.orientation)
+        self._begun = False
         self._script = script
         self._watch = StreamWatch(f'{ARM}/servo_cf')
         self._machine = OperatingStateMachine(lambda: self._watch.cause(time.monotonic_ns()))
@@ -104,6 +121,7 @@ class ArmNode(Node):
             self._bridge_state,
             LATCHED,
         )
+        self._goals = self.create_subscription(PoseStamped, HAND, self._guide, EVENTS)
         self._real_time = ''
         self._diagnostics = Diagnostics(self, self._status)
 
@@ -123,7 +141,8 @@ class ArmNode(Node):
         arm, now = self._arm, time.monotonic_ns()
         self._take_command(now)
         enabled = self._machine.state is State.ENABLED
-        arm.script_running |= self._bridge_enabled and arm.commanded if self._waits else enabled
+        self._begun |= self._bridge_enabled and arm.commanded if self._waits else enabled
+        arm.script_running = self._begun and self._machine.state is not State.PAUSED
         passed = 1 + self._loop.missed - self._missed
         self._missed = self._loop.missed
         arm.advance(now, enabled=enabled, steps=min(passed, _LONGEST_CATCH_UP))
@@ -167,6 +186,25 @@ class ArmNode(Node):
         self._measured_cp.publish(self._cp.encode(stamp, pose))
         self._measured_cv.publish(self._cv.encode(stamp, twist))
         self._measured_cf.publish(self._cf.encode(stamp, wrench))
+
+    def _guide(self, message: PoseStamped) -> None:
+        """Takes a goal for the hand; what cannot be one is refused, and the hand stays."""
+        p, q = message.pose.position, message.pose.orientation
+        position, turn = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+        if message.header.frame_id != FRAME:
+            problem = f'its frame is {message.header.frame_id!r}: give {FRAME!r}'
+        elif not np.isfinite([*position, *turn]).all():
+            problem = 'a number is not finite'
+        elif abs(np.linalg.norm(turn) - 1) > 0.01:
+            problem = f'its quaternion has length {np.linalg.norm(turn):.3g}: it must be 1'
+        else:
+            to_device = Rotation.from_matrix(self._frame.rotation()).inv()
+            orientation = (to_device * Rotation.from_quat(turn)).as_quat()
+            self._arm.guide(self._frame.to_device(position), orientation)
+            return
+        self.get_logger().warning(
+            f'goal of the hand refused: {problem}', throttle_duration_sec=1.0
+        )
 
     def _bridge_state(self, message: Any) -> None:
         self._bridge_enabled = message.state == State.ENABLED

@@ -85,6 +85,7 @@ class ForcePath:
     ) -> None:
         check_together(tool, device, haptics, profile)
         self.haptics = haptics
+        self._tool, self._device, self._profile = tool, device, profile
         self.stale_trips = 0
         self.rejected = 0
         self.contact_time = 0.0
@@ -105,6 +106,22 @@ class ForcePath:
         self._depths = np.zeros((_REMEMBERED, 4))
         self._contact = NONE
         self._was_enabled = self._stale = False
+
+    def scale_force(self, force_scale: float) -> None:
+        """Changes how much of the tissue's force the hand feels; the slew limit makes it gradual.
+
+        Args:
+            force_scale: hand force over tissue force.
+
+        Raises:
+            SettingsError: the coupling would be stiffer than the device bears.
+            ValidationError: it is no scale.
+        """
+        values = self.haptics.model_dump() | {'force_scale': force_scale}
+        haptics = HapticsSettings.model_validate(values)
+        check_together(self._tool, self._device, haptics, self._profile)
+        self._setup = chain.make_setup(self._tool, self._device, haptics, self._profile)
+        self.haptics = haptics
 
     @property
     def force_norm(self) -> float:

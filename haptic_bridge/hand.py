@@ -1,5 +1,6 @@
 """The operator's hand: a scripted target, tremor, and the spring that pulls the tool there."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,10 @@ _FASTEST = 2.0
 _TREMOR_BAND = (8.0, 12.0)
 _TREMOR_TONES = 5
 _PEAK_OF_MINIMUM_JERK = 1.875
+_PURSUIT = 25.0
+"""[rad/s] with which a guided hand goes after its goal, critically damped: 0.15 s behind it."""
+_FASTEST_GUIDED = 0.5
+"""[m/s] of a guided hand: a goal that jumps across the tissue must not throw the arm."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +128,8 @@ def _orientations(poses: list[PoseSettings], tissue_from_device: Transform) -> n
 class Hand:
     """Where the hand wants the tool, and how firmly it holds it.
 
+    It follows its script until somebody guides it; from then on it goes after the goals it is given.
+
     Args:
         settings: stiffness, damping, tremor.
         script: what it does.
@@ -145,7 +152,27 @@ class Hand:
         self._tremor = settings.tremor * np.sqrt(2 / _TREMOR_TONES)
         self._tones = 2 * np.pi * random.uniform(*_TREMOR_BAND, shape)
         self._angles = random.uniform(0, 2 * np.pi, shape)
+        self._goal: tuple[np.ndarray, np.ndarray] | None = None
+        self._held = np.empty(3), np.zeros(3)
         self.move_to(0.0, 0.0)
+        self._tremor_time = 0.0
+
+    @property
+    def guided(self) -> bool:
+        """Whether it has left its script."""
+        return self._goal is not None
+
+    def guide(self, position: np.ndarray, orientation: np.ndarray) -> None:
+        """Gives the hand a goal, which it approaches smoothly from where it is.
+
+        Args:
+            position: [m], shape (3,), in the frame of the script.
+            orientation: quaternion x y z w, shape (4,).
+        """
+        if self._goal is None:
+            self._held = self.position.copy(), self.velocity.copy()
+        turn = orientation / np.linalg.norm(orientation)
+        self._goal = np.array(position, float), turn if turn @ self.orientation >= 0 else -turn
 
     def move_to(self, time: float, tremor_time: float) -> None:
         """Sets the target.
@@ -154,12 +181,12 @@ class Hand:
             time: [s] in the script; 0 is its start, and after its end it stays.
             tremor_time: [s]; tremor goes on while the script waits.
         """
-        script = self.script
-        _follow(
-            time,
-            (script.times, script.positions, script.orientations),
-            (self.position, self.velocity, self.orientation),
-        )
+        script, target = self.script, (self.position, self.velocity, self.orientation)
+        if self._goal is None:
+            _follow(time, (script.times, script.positions, script.orientations), target)
+        else:
+            _pursue(tremor_time - self._tremor_time, self._goal, self._held, target)
+        self._tremor_time = tremor_time
         if self._tremor > 0:
             _tremble(
                 tremor_time, self._tremor, self._tones, self._angles, self.position, self.velocity
@@ -197,6 +224,34 @@ def _follow(time, script, target):
         )
     for k in range(4):
         orientation[k] = before * orientations[i, k] + after * orientations[i + 1, k]
+
+
+@njit(cache=True)
+def _pursue(step, goal, held, target):
+    place, turn = goal
+    held_position, held_velocity = held
+    position, velocity, orientation = target
+    # Implicit in the velocity: stable at any step.
+    weight = 1 / (1 + step * (2 * _PURSUIT + step * _PURSUIT**2))
+    speed = 0.0
+    for axis in range(3):
+        pull = _PURSUIT**2 * (place[axis] - held_position[axis])
+        held_velocity[axis] = weight * (held_velocity[axis] + step * pull)
+        speed += held_velocity[axis] ** 2
+    slower = min(1.0, _FASTEST_GUIDED / max(math.sqrt(speed), 1e-12))
+    for axis in range(3):
+        held_velocity[axis] *= slower
+        held_position[axis] += step * held_velocity[axis]
+        position[axis] = held_position[axis]
+        velocity[axis] = held_velocity[axis]
+    part = 1 - math.exp(-_PURSUIT * step)
+    norm = 0.0
+    for k in range(4):
+        orientation[k] += part * (turn[k] - orientation[k])
+        norm += orientation[k] ** 2
+    norm = math.sqrt(norm)
+    for k in range(4):
+        orientation[k] /= norm
 
 
 @njit(cache=True)

@@ -12,7 +12,9 @@ from cutting_trainer_msgs.srv import GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.duration import Duration
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from haptic_bridge.convention import DeviceConvention
 from haptic_bridge.crtk import DeviceState, HoldButton, StateInterface
@@ -185,8 +187,8 @@ class HapticBridge(Node):
     Parameters:
         scene: path of the scene file.
         auto_enable: enter ENABLED when device, force and surface are fresh for the first time.
-        Never again after
-            that: a FAULT is left by a command only.
+            Never again after that: a FAULT is left by a command only.
+        force_scale: hand force over tissue force; may be set while the node runs.
     """
 
     def __init__(self) -> None:
@@ -216,6 +218,8 @@ class HapticBridge(Node):
         self._interface = StateInterface(self, 'haptic_bridge', self._machine)
         self._device = DeviceState(self, ros.ARM, self._machine)
         self._button = HoldButton(self, ros.ARM, self._machine) if device.hold_button else None
+        self.declare_parameter('force_scale', haptics.force_scale)
+        self.add_on_set_parameters_callback(self._set_parameters)
         self._epoch = time.time_ns() - time.monotonic_ns()
         self._stale_trips = 0
         self._diagnostics = ros.Diagnostics(self, self._collect)
@@ -236,6 +240,18 @@ class HapticBridge(Node):
         self._send((0.0,) * 6, time.monotonic_ns())
         self._wrench.wait_for_all_acked(Duration(seconds=0.2))
         self._diagnostics.publish()
+
+    def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            if parameter.name != 'force_scale':
+                reason = f'{parameter.name} is read once, at the start of the node'
+                return SetParametersResult(successful=False, reason=reason)
+            try:
+                self._path.scale_force(parameter.value)
+            except ValueError as error:
+                reason = ' '.join(str(error).split())
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
 
     def _cause(self) -> str:
         now = time.monotonic_ns()
@@ -328,6 +344,7 @@ class HapticBridge(Node):
             'simulation_age': path.simulation_age(now),
             'stale_trips': path.stale_trips,
             'rejected': path.rejected,
+            'force_scale': path.haptics.force_scale,
             'energy': path.energy,
             'damping': path.damping,
             'revision': surface.revision if surface is not None else -1,

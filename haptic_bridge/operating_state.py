@@ -16,6 +16,8 @@ class State(StrEnum):
 
 
 COMMANDS = ('enable', 'disable', 'pause', 'resume', 'home', 'unhome')
+E_STOP = 'e_stop'
+"""One more command that CRTK does not have: FAULT from any state, as a red button would do."""
 
 # Pairs that are not listed are invalid and change nothing, PAUSED + enable among them.
 _TRANSITIONS = {
@@ -35,8 +37,8 @@ _TRANSITIONS = {
 class OperatingStateMachine:
     """The states of one device or bridge that needs no homing motion. Threads may share it.
 
-    FAULT is entered when something is wrong, never because a command asks for it, and stays until
-    `enable` or `disable` retries. `enable` succeeds when `cause` says that nothing is wrong.
+    FAULT is entered when something is wrong, and by `E_STOP`; none of CRTK's commands leads there. It
+    stays until `enable` or `disable` retries. `enable` succeeds when `cause` says that nothing is wrong.
 
     Args:
         cause: why force is impossible now, as a sentence, or '' when nothing is wrong. Asked before
@@ -63,14 +65,18 @@ class OperatingStateMachine:
         return False
 
     def command(self, name: str) -> str:
-        """Carries out one of `COMMANDS`.
+        """Carries out one of `COMMANDS`, or `E_STOP`.
 
         Returns:
             '' when done, else why not as a sentence; the state is then unchanged, or FAULT with
             the new reason where a cause forbids ENABLED.
         """
+        if name == E_STOP:
+            self.fault('emergency stop')
+            return ''
         if name not in COMMANDS:
-            return f'unknown state command {name!r}: use one of {", ".join(COMMANDS)}'
+            known = ', '.join((*COMMANDS, E_STOP))
+            return f'unknown state command {name!r}: use one of {known}'
         with self._lock:
             if name in ('home', 'unhome'):
                 homed = name == 'home'

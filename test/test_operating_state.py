@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from haptic_bridge.operating_state import (
     COMMANDS,
+    E_STOP,
     OperatingStateMachine,
     State,
     crtk_types,
@@ -56,6 +57,19 @@ def test_table_of_transitions_is_that_of_crtk(before, command, after, invalid):
 
 def test_enable_while_paused_points_to_resume():
     assert 'use resume' in machine_in(P).command('enable')
+
+
+@pytest.mark.parametrize('before', State)
+def test_emergency_stop_is_a_fault_from_every_state_until_a_command_leaves_it(before):
+    machine = machine_in(before)
+    assert machine.command(E_STOP) == ''
+    assert machine.state is F
+    assert machine.reason == ('the cable is off' if before is F else 'emergency stop')
+    for refused in ('resume', 'pause'):
+        assert machine.command(refused)
+        assert machine.state is F
+    assert machine.command('disable') == ''
+    assert machine.state is D
 
 
 @given(st.lists(st.sampled_from(COMMANDS)))

@@ -25,6 +25,7 @@ FRAME_INPUTS = 'tissue/frame_inputs'
 CONTACT = 'tool/contact'
 CUT = 'cutting/cut'
 ARM = 'arm'
+HAND = f'{ARM}/hand/servo_cp'
 DIAGNOSTICS = '/diagnostics'
 
 

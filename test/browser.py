@@ -1,0 +1,195 @@
+"""A headless Chromium, driven by its DevTools protocol: what a person does with mouse and eyes.
+
+Pictures are drawn by software, so that no graphics card is needed.
+"""
+
+import base64
+import io
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from PIL import Image
+from websockets.sync.client import connect
+
+SIZE = (1280, 800)
+PATIENCE = 60.0
+_CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+needs_chromium = pytest.mark.skipif(
+    _CHROMIUM is None, reason='chromium is not installed: sudo apt install chromium'
+)
+
+
+class Page:
+    """One page that is open in the browser.
+
+    Args:
+        address: of its DevTools socket.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._socket = connect(address, max_size=None)
+        self._numbers = itertools.count(1)
+        self.requests: list[str] = []
+        self.call('Page.enable')
+        self.call('Network.enable')
+
+    def call(self, method: str, **parameters: Any) -> Any:
+        """Calls a method of the protocol and returns its result."""
+        number = next(self._numbers)
+        self._socket.send(json.dumps({'id': number, 'method': method, 'params': parameters}))
+        while True:
+            message = json.loads(self._socket.recv(PATIENCE))
+            if message.get('method') == 'Network.requestWillBeSent':
+                self.requests.append(message['params']['request']['url'])
+            if message.get('id') == number:
+                assert 'error' not in message, message
+                return message['result']
+
+    def open(self, url: str) -> None:
+        """Goes to a page."""
+        self.call('Page.navigate', url=url)
+
+    def evaluate(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        done = self.call('Runtime.evaluate', expression=script, returnByValue=True)
+        return done['result'].get('value')
+
+    def picture(self) -> np.ndarray:
+        """What is seen, shape (height, width, 3), 0 to 255."""
+        data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
+        return np.array(Image.open(io.BytesIO(data)).convert('RGB'))
+
+    def save(self, file: Path) -> None:
+        """Writes what is seen as PNG."""
+        Image.fromarray(self.picture()).save(file)
+
+    def mouse(self, kind: str, x: float, y: float, *, pressed: bool = False) -> None:
+        """One event of the mouse at a place [pixel]."""
+        self.call(
+            'Input.dispatchMouseEvent',
+            type=kind,
+            x=x,
+            y=y,
+            button='left' if pressed or kind != 'mouseMoved' else 'none',
+            buttons=int(pressed),
+            clickCount=int(kind != 'mouseMoved'),
+        )
+
+    def drag(self, points: np.ndarray, step: float = 0.03) -> None:
+        """Presses at the first place [pixel], moves through the others, and lets go at the last."""
+        self.mouse('mouseMoved', *points[0])
+        time.sleep(10 * step)
+        self.mouse('mousePressed', *points[0], pressed=True)
+        for point in points[1:]:
+            time.sleep(step)
+            self.mouse('mouseMoved', *point, pressed=True)
+        time.sleep(10 * step)
+        self.mouse('mouseReleased', *points[-1])
+
+    def click(self, text: str) -> None:
+        """Clicks the button that says this."""
+        script = f"""(() => {{
+            const all = [...document.querySelectorAll('button')];
+            const one = all.find(b => b.innerText.trim() === {json.dumps(text)});
+            if (!one) return null;
+            one.scrollIntoView({{block: 'nearest'}});
+            const r = one.getBoundingClientRect();
+            return [r.x + r.width / 2, r.y + r.height / 2];
+        }})()"""
+        place = self.wait(lambda: self.evaluate(script), f'the button {text}')
+        self.mouse('mouseMoved', *place)
+        self.mouse('mousePressed', *place, pressed=True)
+        self.mouse('mouseReleased', *place)
+
+    def says(self, text: str) -> bool:
+        """Whether the page shows a text."""
+        return text in (self.evaluate('document.body.innerText') or '')
+
+    def wait(self, condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> Any:
+        """Waits for a condition to be true, and returns it."""
+        deadline = time.monotonic() + patience
+        while not (value := condition()):
+            assert time.monotonic() < deadline, f'waited in vain for {what}'
+            time.sleep(0.1)
+        return value
+
+    def close(self) -> None:
+        """Leaves the page to the browser."""
+        self._socket.close()
+
+
+class Browser:
+    """A browser that runs.
+
+    Args:
+        port: of the DevTools.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self.pages: list[Page] = []
+
+    def page(self, url: str = 'about:blank') -> Page:
+        """Opens one more page."""
+        from urllib.request import Request
+
+        request = Request(f'http://127.0.0.1:{self._port}/json/new?about:blank', method='PUT')
+        with urlopen(request) as answer:
+            page = Page(json.load(answer)['webSocketDebuggerUrl'])
+        width, height = SIZE
+        page.call(
+            'Emulation.setDeviceMetricsOverride',
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        page.open(url)
+        self.pages.append(page)
+        return page
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A browser with a profile of its own, that reaches this machine only; gone in the end."""
+    assert _CHROMIUM is not None
+    with tempfile.TemporaryDirectory(prefix='chromium-', ignore_cleanup_errors=True) as profile:
+        command = [_CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
+        command += [f'--user-data-dir={profile}', '--no-first-run', '--disable-extensions']
+        command += ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--mute-audio']
+        command += ['--disable-background-networking', '--disable-dev-shm-usage']
+        command += ['--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1']
+        with Path(profile, 'said').open('wb') as said:
+            process = subprocess.Popen(
+                command,
+                stdout=said,
+                stderr=said,
+                start_new_session=True,
+                preexec_fn=lambda: os.nice(10),
+            )
+        try:
+            file = Path(profile, 'DevToolsActivePort')
+            deadline = time.monotonic() + PATIENCE
+            while not (file.exists() and file.read_text().count('\n')):
+                assert process.poll() is None, Path(profile, 'said').read_text()
+                assert time.monotonic() < deadline, 'chromium does not start'
+                time.sleep(0.05)
+            browser = Browser(int(file.read_text().splitlines()[0]))
+            yield browser
+            for page in browser.pages:
+                page.close()
+        finally:
+            os.killpg(process.pid, 9)
+            process.wait()
