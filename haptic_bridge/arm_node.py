@@ -56,8 +56,8 @@ class ArmNode(Node):
             arm itself is ENABLED. In the state PAUSED it stands still.
         guided: the hand has no script; it stays at its start until it is given goals.
 
-    A goal for the hand on `arm/hand/servo_cp`, in the tissue frame as the script is, takes the hand off
-    its script for good.
+    A goal for the hand on `arm/hand/servo_cp`, in the tissue frame as the script is, takes the hand
+    off its script for good.
 
     It speaks as the scene's section `device` says (unit, mirrored axis, sign, force frame), so that
     a bridge with the same scene understands it.
@@ -202,9 +202,7 @@ class ArmNode(Node):
             orientation = (to_device * Rotation.from_quat(turn)).as_quat()
             self._arm.guide(self._frame.to_device(position), orientation)
             return
-        self.get_logger().warning(
-            f'goal of the hand refused: {problem}', throttle_duration_sec=1.0
-        )
+        self.get_logger().warning(f'goal of the hand refused: {problem}', throttle_duration_sec=1.0)
 
     def _bridge_state(self, message: Any) -> None:
         self._bridge_enabled = message.state == State.ENABLED

@@ -128,7 +128,8 @@ def _orientations(poses: list[PoseSettings], tissue_from_device: Transform) -> n
 class Hand:
     """Where the hand wants the tool, and how firmly it holds it.
 
-    It follows its script until somebody guides it; from then on it goes after the goals it is given.
+    It follows its script until somebody guides it; from then on it goes after the goals that it is
+    given.
 
     Args:
         settings: stiffness, damping, tremor.

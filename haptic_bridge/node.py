@@ -5,14 +5,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from cutting_trainer_msgs.msg import Contact, ForceSample, Mesh, MeshDelta
-from cutting_trainer_msgs.srv import GetMesh
+from cutting_trainer_msgs.msg import Contact, ForceSample
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.duration import Duration
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -32,7 +30,7 @@ from haptic_bridge.wire import (
     WrenchStampedCodec,
 )
 from tissue_sim import ros
-from tissue_sim.replica import MeshReplica
+from tissue_sim.mesh_follower import MeshFollower, require_frame
 from tissue_sim.scene_file import read_section
 from tissue_sim.timing import Durations, PeriodicLoop
 
@@ -40,11 +38,6 @@ FOLLOW_PERIOD = 0.0015
 """[s] between two looks for frames of the simulation."""
 STATE_PERIOD = 0.02
 """[s] between two looks for changes of the operating state."""
-ANSWER_TIMEOUT = 1.0
-"""[s] after which a question for the full mesh is asked again."""
-PATIENCE = 0.5
-"""[s] of nothing but old revisions after which they are those of a simulation started again, or the
-revision here was never one."""
 CLOCK_STEP = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
@@ -59,25 +52,21 @@ class SimulationFollower:
     Attributes:
         surface: the newest whole one; None before the first.
         samples: forces that the fast loop has not taken yet.
-        gaps: how often a revision was missed.
     """
 
     def __init__(self, node: Node, on_error: Callable[[str], None]) -> None:
         self.surface: Surface | None = None
         self.samples: deque[Sample] = deque(maxlen=4)
-        self.gaps = 0
         self._on_error = on_error
-        self._replica = MeshReplica()
-        self._stamp = 0
-        self._accepted = 0.0
+        self._follower = MeshFollower(node)
         self._codec = ForceSampleCodec()
         self._watch = StreamWatch(ros.FORCE)
-        self._mesh = ros.polled(node, Mesh, ros.MESH, ros.LATCHED)
-        self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
         self._force = ros.polled(node, ForceSample, ros.FORCE, ros.STREAM)
-        self._client = node.create_client(GetMesh, ros.GET_MESH)
-        self._answers: deque[Mesh] = deque(maxlen=2)
-        self._asked = 0.0
+
+    @property
+    def gaps(self) -> int:
+        """How often a revision was missed."""
+        return self._follower.gaps
 
     def cause(self, now_ns: int) -> str:
         """Why the simulation's forces cannot be trusted at this time [ns], '' if they can."""
@@ -96,70 +85,25 @@ class SimulationFollower:
                 take()
             except Exception as error:
                 self._on_error(f'message of the simulation: {error}')
-                self._ask()
+                self._follower.ask()
 
     def _take_force(self) -> None:
         taken = ros.take_numbered(self._force)
         if taken is None:
             return
         sample = self._codec.decode(taken[0])
-        _require_frame(ros.FORCE, sample.frame_id)
+        require_frame(ros.FORCE, sample.frame_id)
         self.samples.append(sample)
         problem = self._watch.see(taken[1], sample.stamp_ns, time.monotonic_ns())
         if problem:
             self._on_error(problem)
 
     def _take_surface(self) -> None:
-        known = self._replica.revision, self._replica.topology
-        while (mesh := ros.take(self._mesh)) is not None:
-            self._load(mesh)
-        while self._answers:
-            self._load(self._answers.popleft())
-        while (delta := ros.take(self._updates)) is not None:
-            self._apply(delta)
-        if (self._replica.revision, self._replica.topology) != known:
+        if self._follower.poll():
             self._renew()
 
-    def _load(self, mesh: Mesh) -> None:
-        _require_frame(ros.MESH, mesh.header.frame_id)
-        # A keyframe can arrive after the deltas that follow it; an older revision of a younger
-        # stamp is a simulation that has started again.
-        stamp = _nanoseconds(mesh)
-        younger = mesh.revision > self._replica.revision or stamp > self._stamp
-        if younger or self._waits_in_vain():
-            self._replica.load(mesh)
-            self._stamp, self._accepted = stamp, time.monotonic()
-
-    def _apply(self, delta: MeshDelta) -> None:
-        _require_frame(ros.MESH_UPDATES, delta.header.frame_id)
-        if delta.revision <= self._replica.revision:
-            if self._waits_in_vain():
-                self._ask()
-        elif self._replica.apply(delta):
-            self._stamp = max(self._stamp, _nanoseconds(delta))
-            self._accepted = time.monotonic()
-        elif self._replica.revision >= 0:
-            self._ask()
-
-    def _waits_in_vain(self) -> bool:
-        return time.monotonic() - self._accepted > PATIENCE
-
-    def _ask(self) -> None:
-        now = time.monotonic()
-        if now - self._asked < ANSWER_TIMEOUT or not self._client.service_is_ready():
-            return
-        self._asked = now
-        self.gaps += 1
-        self._client.call_async(GetMesh.Request()).add_done_callback(self._answered)
-
-    def _answered(self, future: Any) -> None:
-        response = future.result()
-        if response is not None and response.success:
-            self._answers.append(response.mesh)
-            self._asked = 0.0
-
     def _renew(self) -> None:
-        replica = self._replica
+        replica = self._follower.replica
         self.surface = Surface(
             replica.positions(),
             replica.triangles,
@@ -167,18 +111,6 @@ class SimulationFollower:
             topology=replica.topology,
             previous=self.surface,
         )
-
-
-def _require_frame(topic: str, frame: str) -> None:
-    if frame != ros.FRAME:
-        raise ValueError(
-            f'{topic} has the frame_id {frame!r}, but forces are felt in {ros.FRAME!r}'
-        )
-
-
-def _nanoseconds(message: Mesh | MeshDelta) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
 
 
 class HapticBridge(Node):

@@ -51,13 +51,45 @@ def demo(
     as_json: Annotated[
         bool, typer.Option('--json', help='Print the summary as JSON on standard output.')
     ] = False,
+    view: Annotated[
+        bool, typer.Option('--view', help='Serve a page that shows the session (see view).')
+    ] = False,
 ) -> None:
     """Run a session: an emulated arm palpates and cuts the tissue, all of it recorded."""
     from session.demo import DemoOptions, run_demo
     from session.domain import parse_domain
 
-    options = DemoOptions(scene, seconds, bag, seed, parse_domain(domain), as_json)
+    options = DemoOptions(scene, seconds, bag, seed, parse_domain(domain), as_json, view)
     raise typer.Exit(int(run_demo(options)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def view(
+    scene: Annotated[
+        str, typer.Option(help='Name of a scene in config/scenes, or path of a scene file.')
+    ] = 'liver',
+    host: Annotated[
+        str,
+        typer.Option(help='Address to serve the page on; 0.0.0.0: open to other machines.'),
+    ] = '127.0.0.1',
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help='Port of the page; 0: one that is free.')
+    ] = 8080,
+    attach: Annotated[
+        bool, typer.Option('--attach', help='Show the graph that runs already; start no session.')
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help='Seed of everything random.')] = 0,
+    domain: Annotated[
+        str,
+        typer.Option(help='ROS domain, or "free" for one of its own (default: ROS_DOMAIN_ID, 0).'),
+    ] = '',
+) -> None:
+    """Run a session in the browser: see the tissue, drag the blade, cut. Ctrl-C ends it."""
+    from session.domain import parse_domain
+    from session.view import ViewOptions, run_view
+
+    options = ViewOptions(scene, host, port, attach, seed, parse_domain(domain))
+    raise typer.Exit(int(run_view(options)))
 
 
 @app.command(epilog=EXIT_STATUSES)

@@ -14,7 +14,16 @@ from haptic_bridge.hand import compile_script
 from session.domain import reserved_domain
 from session.errors import SessionError
 from session.evidence import read_evidence
-from session.graph import ARM_NODE, BRIDGE_NODE, TISSUE_NODE, node_environment, session_nodes
+from session.graph import (
+    ARM_NODE,
+    BRIDGE_NODE,
+    LOCAL,
+    PORT,
+    TISSUE_NODE,
+    node_environment,
+    session_nodes,
+    viewer_command,
+)
 from session.judge import Expected, judge
 from session.node_process import NodeCommand
 from session.processes import Outcome, Supervisor
@@ -43,6 +52,7 @@ class DemoOptions:
         seed: of everything random.
         domain: ROS domain, or `free`.
         as_json: print the summary as JSON.
+        view: serve a page on this machine that shows the session.
     """
 
     scene: str
@@ -51,6 +61,7 @@ class DemoOptions:
     seed: int
     domain: int | Literal['free']
     as_json: bool
+    view: bool = False
 
 
 def run_demo(options: DemoOptions) -> Status:
@@ -63,13 +74,15 @@ def run_demo(options: DemoOptions) -> Status:
     seconds = _duration(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)
     nodes = session_nodes(scene.path, bag, options.seed, seconds)
+    if options.view:
+        nodes.insert(0, viewer_command(scene.path, LOCAL, PORT, session=False))
     console, notes = Console(), Console(stderr=True)
     with reserved_domain(options.domain) as domain:
         outcome = _run(nodes, seconds, bag, domain, notes)
     if outcome.interrupted and not outcome.deaths:
         notes.print(f'interrupted (exit status {int(Status.INTERRUPTED)})', highlight=False)
     if not outcome.ran:
-        return _not_run(outcome, bag, notes)
+        return not_run(outcome, bag, notes)
     try:
         with notes.status('reading the bag'):
             summary = summarise(read_evidence(bag))
@@ -161,7 +174,7 @@ def _run(
         return supervisor.end()
 
 
-def _not_run(outcome: Outcome, bag: Path, notes: Console) -> Status:
+def not_run(outcome: Outcome, bag: Path, notes: Console) -> Status:
     """Says why the nodes did not come up."""
     if outcome.interrupted:
         return Status.INTERRUPTED

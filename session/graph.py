@@ -11,7 +11,7 @@ from session.node_process import NodeCommand
 from tissue_sim.share import PACKAGES, share_folder
 
 ARM_NODE, BRIDGE_NODE, TISSUE_NODE = 'emulated_arm', 'haptic_bridge', 'tissue_sim'
-CUTTING_NODE, RECORDER_NODE = 'cutting', 'recorder'
+CUTTING_NODE, RECORDER_NODE, VIEWER_NODE = 'cutting', 'recorder', 'viewer'
 
 MODULES = {
     ARM_NODE: 'haptic_bridge.arm_node',
@@ -19,8 +19,13 @@ MODULES = {
     TISSUE_NODE: 'tissue_sim.node',
     CUTTING_NODE: 'cutting.node',
     RECORDER_NODE: 'bags.node',
+    VIEWER_NODE: 'viewer.node',
 }
+SIMULATION = (ARM_NODE, BRIDGE_NODE, TISSUE_NODE, CUTTING_NODE)
+"""The nodes of a session, without who only listens."""
 CLOSING_A_BAG = 20.0  # [s]
+LOCAL, PORT = '127.0.0.1', 8080
+"""Where the page is served unless the user says else."""
 RANGE, PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
@@ -38,10 +43,32 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
         BRIDGE_NODE: {'auto_enable': True},
     }
     common = {'scene': str(scene), 'seed': seed}
-    commands = [
-        node_command(name, common | own.get(name, {})) for name in MODULES if name != RECORDER_NODE
-    ]
+    commands = [node_command(name, common | own.get(name, {})) for name in SIMULATION]
     return [*commands, recorder_command(scene, bag, seed)]
+
+
+def simulation_nodes(scene: Path, seed: int) -> list[NodeCommand]:
+    """Commands for a session that waits for its operator: the hand has no script, no force is on.
+
+    Args:
+        scene: file that all of them read.
+        seed: of everything random.
+    """
+    common = {'scene': str(scene), 'seed': seed}
+    own = {ARM_NODE: {'guided': True}}
+    return [node_command(name, common | own.get(name, {})) for name in SIMULATION]
+
+
+def viewer_command(scene: Path, host: str, port: int, *, session: bool) -> NodeCommand:
+    """The page.
+
+    Args:
+        scene: file that the session runs.
+        host, port: where the page is served.
+        session: whether the launcher does what the page asks for.
+    """
+    parameters = {'scene': str(scene), 'host': host, 'port': port, 'session': session}
+    return replace(node_command(VIEWER_NODE, parameters), converses=session)
 
 
 def node_command(

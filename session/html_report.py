@@ -23,11 +23,12 @@ from haptic_bridge.chain import INSIDE, NONE
 from haptic_bridge.wire import PoseStampedCodec
 from session.errors import SessionError
 from session.evidence import read_evidence
-from session.incision import depths, distance_to_ways, extent, planned_ways, surface_length
+from session.incision import distance_to_ways, extent, planned_ways, surface_length
 from session.picture import STYLE, Story, draw_tissue, read_story, spans
 from session.recorded_scene import restore_scene
 from session.scene import load_scene
 from session.summary import NodeSummary, Summary, summarise
+from tissue_sim.depth import DepthGauge
 from tissue_sim.replica import MeshReplica
 
 Floats = NDArray[np.float64]
@@ -94,7 +95,7 @@ def _body(
     script: ScriptSettings | None,
 ) -> str:
     tool = story.tool[::_EVERY]
-    depth = depths(tool[:, 7:10], before)
+    depth = DepthGauge(before).depths(tool[:, 7:10])
     begun = datetime.fromtimestamp(first_time(bag) * 1e-9, UTC)
     data = bag.custom_data
     about = ', '.join(

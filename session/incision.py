@@ -4,8 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_bridge.arm_settings import ScriptSettings
-from tissue_sim.locate import distance_to_triangles, locate_points
-from tissue_sim.mesh import TetMesh
 from tissue_sim.replica import MeshReplica
 
 Floats = NDArray[np.float64]
@@ -26,25 +24,6 @@ def surface_length(tissue: MeshReplica) -> float:
     lips = pairs[(of_cut > 0) & (of_outside > 0)]
     ends = tissue.rest[lips]
     return 0.5 * float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
-
-
-def depths(points: Floats, tissue: MeshReplica) -> Floats:
-    """How deep points lie under the surface of the tissue at rest, 0 outside [m], shape (p,).
-
-    Args:
-        points: [m], shape (p, 3).
-        tissue: before any cut.
-    """
-    mesh = TetMesh(tissue.rest, tissue.tetrahedra, tissue.fixed)
-    found = np.empty(len(points), np.int64)
-    points = np.ascontiguousarray(points)
-    weights = np.empty((len(points), 4))
-    locate_points(mesh.rest, mesh.tetrahedra, mesh.neighbors, points, 0, found, weights)
-    free = mesh.triangles[~(mesh.fixed[mesh.triangles] == 1).all(axis=1)]
-    out = np.zeros(len(points))
-    for i in np.flatnonzero(found >= 0):
-        out[i] = distance_to_triangles(points[i], mesh.rest, free)
-    return out
 
 
 def planned_ways(script: ScriptSettings) -> list[Floats]:

@@ -1,5 +1,6 @@
 """One node as a process of the operating system: its command, its lines, its log, its end."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -25,12 +26,14 @@ class NodeCommand:
         argv: program and arguments.
         records: it keeps the record of the others: it starts before them, ends after them, and is
             asked to end, not killed, when the launcher dies or the user is in a hurry.
+        converses: it asks for things by lines `message: ...`, and reads answers on standard input.
         grace: [s] that it has to end after SIGINT, and half of it again after SIGTERM.
     """
 
     name: str
     argv: tuple[str, ...]
     records: bool = False
+    converses: bool = False
     grace: float = 5.0
 
 
@@ -91,7 +94,7 @@ class NodeProcess:
         orphaned = signal.SIGTERM if command.records else signal.SIGKILL
         self.process = subprocess.Popen(
             [*_BOUND, str(os.getpid()), str(int(orphaned)), *command.argv],
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE if command.converses else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env=dict(environment),
@@ -100,6 +103,8 @@ class NodeProcess:
         assert self.process.stdout is not None
         self.pipe = self.process.stdout
         os.set_blocking(self.pipe.fileno(), False)
+        if self.process.stdin is not None:
+            os.set_blocking(self.process.stdin.fileno(), False)
 
     @property
     def name(self) -> str:
@@ -119,6 +124,19 @@ class NodeProcess:
         self.send_group(signal.SIGKILL)
         self.process.wait()
         return True
+
+    def answer(self, text: str) -> None:
+        """Writes a line to a node that converses, as long as it lives and listens."""
+        if self.process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError, BlockingIOError):
+                os.write(self.process.stdin.fileno(), f'{text}\n'.encode())
+
+    def close(self) -> None:
+        """Closes what belongs to a process that has ended."""
+        self.log.close()
+        self.pipe.close()
+        if self.process.stdin is not None:
+            self.process.stdin.close()
 
     def send(self, number: signal.Signals) -> None:
         if self.alive:

@@ -3,7 +3,7 @@
 import selectors
 import signal
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -22,7 +22,7 @@ ASKED_FOR = (0, -signal.SIGINT, -signal.SIGTERM)
 class Event:
     """What the supervisor tells while it works; `text` is a sentence or a node's own line."""
 
-    kind: Literal['ready', 'phase', 'warning', 'died', 'ending', 'killed']
+    kind: Literal['ready', 'phase', 'message', 'warning', 'died', 'ending', 'killed']
     node: str
     text: str
 
@@ -134,15 +134,52 @@ class Supervisor:
         Returns:
             Whether all are ready; if not, the outcome says why.
         """
-        deadline = time.monotonic() + timeout
-        for records in (True, False):
-            for command in self._commands:
-                if command.records == records and not self._interrupts:
-                    self._start(command)
-            if not self._wait_ready(deadline, timeout):
-                return False
+        if not self._start_all(self._commands, timeout):
+            return False
         self._began = time.monotonic()
         self.outcome.ran = True
+        return True
+
+    def replace(self, commands: Sequence[NodeCommand], timeout: float = 60.0) -> bool:
+        """Ends the nodes of some names, where they run, and starts these in their stead.
+
+        Args:
+            commands: to run from now on.
+            timeout: [s] in which all must be ready.
+
+        Returns:
+            Whether all are ready; if not, the outcome says why, and `remove` takes back the rest.
+        """
+        self.remove([command.name for command in commands])
+        self.outcome.unready = ''
+        kept = [c for c in self._commands if all(c.name != new.name for new in commands)]
+        self._commands = [*kept, *commands]
+        return self._start_all(commands, timeout)
+
+    def remove(self, names: Collection[str]) -> None:
+        """Ends some nodes; those that record after the others."""
+        for records in (False, True):
+            nodes = [node for name, node in self._nodes.items() if name in names]
+            self._end([node for node in nodes if node.command.records == records], 0)
+        self._poll(0.0)
+        for name in names:
+            if (node := self._nodes.pop(name, None)) is not None:
+                self._close(node)
+
+    def answer(self, name: str, text: str) -> None:
+        """Writes a line to a node that converses."""
+        if name in self.pids:
+            self._nodes[name].answer(text)
+
+    def _start_all(self, commands: Sequence[NodeCommand], timeout: float) -> bool:
+        deadline = time.monotonic() + timeout
+        deaths = len(self.outcome.deaths)
+        for records in (True, False):
+            for command in commands:
+                if command.records == records and not self._interrupts:
+                    self._start(command)
+            if not self._wait_ready(deadline, timeout, deaths):
+                return False
         return True
 
     def run(
@@ -180,8 +217,7 @@ class Supervisor:
             self._end([n for n in nodes if n.command.records == records], patience)
         self._poll(0.0)
         for node in self._nodes.values():
-            node.log.close()
-            node.pipe.close()
+            self._close(node)
         self._nodes.clear()
         self._selector.close()
         self._selector = selectors.DefaultSelector()
@@ -196,9 +232,14 @@ class Supervisor:
         self._nodes[command.name] = node
         self._selector.register(node.pipe, selectors.EVENT_READ, node)
 
-    def _wait_ready(self, deadline: float, timeout: float) -> bool:
-        while not self._interrupts and not self.outcome.deaths:
-            waiting = [node for node in self._nodes.values() if not node.ready]
+    def _close(self, node: NodeProcess) -> None:
+        if not node.silent:
+            self._selector.unregister(node.pipe)
+        node.close()
+
+    def _wait_ready(self, deadline: float, timeout: float, deaths: int) -> bool:
+        while not self._interrupts and len(self.outcome.deaths) == deaths:
+            waiting = [node for node in self._nodes.values() if node.alive and not node.ready]
             if not waiting:
                 return True
             if time.monotonic() > deadline:
@@ -238,8 +279,9 @@ class Supervisor:
             node.done = True
         elif line.startswith(said := f'failed: {node.name}: '):
             self.outcome.failures.append(line.removeprefix(said))
-        elif line.startswith('phase: '):
-            self._tell(Event('phase', node.name, line.removeprefix('phase: ')))
+        elif line.startswith(('phase: ', 'message: ')):
+            kind, _, text = line.partition(': ')
+            self._tell(Event('phase' if kind == 'phase' else 'message', node.name, text))
         elif is_warning(line):
             node.warnings += 1
             if node.warnings <= MOST_SHOWN:

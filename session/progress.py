@@ -1,5 +1,6 @@
 """What a running session shows: one live line on a terminal, plain lines elsewhere."""
 
+import json
 import re
 from types import TracebackType
 from typing import Self
@@ -62,6 +63,9 @@ class SessionProgress:
                 clock=f'{self._ready}/{self._nodes}',
             )
             self._plainly(f'{event.node} is ready')
+        elif event.kind == 'message':
+            page = json.loads(event.text)['page']
+            self._console.print(f'page: {page}', highlight=False, soft_wrap=True)
         elif event.kind == 'phase':
             self._phase = text
             self._plainly(text)

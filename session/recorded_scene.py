@@ -47,7 +47,7 @@ def restore_scene(bag: Bag, folder: Path, changes: Mapping[str, str] | None = No
     scene['tissue']['mesh'] = MESH_FILE
     scene['tissue']['unit'] = 'm'
     for key, value in (changes or {}).items():
-        _change(scene, key, value)
+        change(scene, key, value)
     path = folder / Path(bag.custom_data.get('scene_file', 'scene.yaml')).name
     out = StringIO()
     yaml.dump(scene, out)
@@ -79,7 +79,17 @@ def parse_changes(arguments: list[str]) -> dict[str, str]:
     return changes
 
 
-def _change(scene: dict[str, object], key: str, value: str) -> None:
+def change(scene: dict[str, object], key: str, value: str) -> None:
+    """Replaces one value of a scene.
+
+    Args:
+        scene: as read from its file.
+        key: dotted, as in `tissue.material.toughness`.
+        value: in YAML.
+
+    Raises:
+        SessionError: the key names no place, or the value is none.
+    """
     *path, last = key.split('.')
     if not path:
         raise SessionError(f'--with {key}: give section and key, as in cutting.{key}')

@@ -23,7 +23,7 @@ import pytest
 from PIL import Image
 from websockets.sync.client import connect
 
-SIZE = (1280, 800)
+SIZE = (1060, 640)
 PATIENCE = 60.0
 _CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
 needs_chromium = pytest.mark.skipif(
@@ -177,7 +177,6 @@ def chromium() -> Iterator[Browser]:
                 stdout=said,
                 stderr=said,
                 start_new_session=True,
-                preexec_fn=lambda: os.nice(10),
             )
         try:
             file = Path(profile, 'DevToolsActivePort')

@@ -19,9 +19,10 @@ from haptic_bridge.wire import ForceSampleCodec
 from session.errors import SessionError
 from session.export import export
 from session.html_report import force_peaks, incision_area, write_report
-from session.incision import depths, distance_to_ways, extent, planned_ways, surface_length
+from session.incision import distance_to_ways, extent, planned_ways, surface_length
 from session.recorded_scene import restore_scene
 from session.scene import load_scene
+from tissue_sim.depth import DepthGauge
 from tissue_sim.mesh import TetMesh
 from tissue_sim.replica import MeshReplica
 
@@ -54,7 +55,9 @@ def test_the_length_of_an_incision_is_half_of_its_lips() -> None:
 
 def test_depth_is_the_distance_under_the_free_surface() -> None:
     points = np.array([[0.02, 0.01, 0.017], [0.02, 0.01, 0.025], [0.02, 0.0115, 0.001]])
-    np.testing.assert_allclose(depths(points, block_of()), [0.003, 0.0, 0.0085], atol=1e-12)
+    np.testing.assert_allclose(
+        DepthGauge(block_of()).depths(points), [0.003, 0.0, 0.0085], atol=1e-12
+    )
 
 
 def test_distance_to_the_plan_is_seen_from_above() -> None:

@@ -1,0 +1,250 @@
+"""Claims about the page of a live session, made with a browser as a person would use it.
+
+One session: look, start, record, drag the blade down and along, reload, stop.
+"""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import Browser, Page, chromium, needs_chromium
+from live import MEASURED_CP, SERVO_CF, Recording, free_domain
+
+from haptic_bridge.chain import INSIDE, TOUCHING
+from haptic_bridge.operating_state import E_STOP
+from haptic_bridge.wire import ContactCodec
+from session.scene import load_scene
+from tissue_sim.assembly import make_simulation
+from viewer.stage import FIELD_OF_VIEW, framing
+
+pytestmark = [pytest.mark.slow, pytest.mark.real_time, needs_chromium]
+
+ROOT = Path(__file__).resolve().parents[1]
+GRIP = 0.028
+"""[m] from the tip to where the arrows of the handles are gripped."""
+DOWN, ALONG = 0.050, 0.035
+"""[m] that the blade is dragged."""
+SCENE = 'liver'
+
+
+@dataclass
+class Seen:
+    """What the pages showed, and when things were done."""
+
+    pictures: dict[str, np.ndarray] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
+    requests: list[str] = field(default_factory=list)
+    bag: Path = Path()
+    status: int = -1
+
+
+class View:
+    """`trainer view` as a process of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self._said = folder / 'said'
+        command = [sys.executable, '-m', 'session.cli', 'view', '--scene', SCENE, '--port', '0']
+        with self._said.open('wb') as file:
+            self.process = subprocess.Popen(
+                [*command, '--domain', str(free_domain())],
+                cwd=ROOT,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {'COLUMNS': '200'},
+                start_new_session=True,
+            )
+
+    def url(self) -> str:
+        """Where the page is, once all nodes are ready."""
+        deadline = time.monotonic() + 120
+        while self._said.read_text().count(' is ready') < 5:
+            assert self.process.poll() is None and time.monotonic() < deadline, self.said
+            time.sleep(0.1)
+        found = re.search(r'page: (http://127\.0\.0\.1:\d+)$', self.said, re.MULTILINE)
+        assert found, self.said
+        return found[1]
+
+    @property
+    def said(self) -> str:
+        return self._said.read_text()
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(60)
+
+
+class Eye:
+    """Where points of the tissue frame are on the page, for its first camera."""
+
+    def __init__(self, page: Page, positions: np.ndarray) -> None:
+        position, aim = framing(positions)
+        forward = (aim - position) / np.linalg.norm(aim - position)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        self._position = position
+        self._axes = np.stack([right, np.cross(right, forward), forward])
+        box = "document.querySelector('canvas').getBoundingClientRect()"
+        found = page.evaluate(f'(r => JSON.stringify([r.x, r.y, r.width, r.height]))({box})')
+        self.box = np.array(json.loads(found))
+
+    def pixels(self, points: np.ndarray) -> np.ndarray:
+        x, y, depth = self._axes @ (np.asarray(points) - self._position).T
+        scale = self.box[3] / 2 / np.tan(FIELD_OF_VIEW / 2)
+        middle = self.box[:2] + self.box[2:] / 2
+        return middle + scale * np.stack([x / depth, -y / depth], axis=1)
+
+
+def way(start: np.ndarray, axis: np.ndarray, length: float) -> np.ndarray:
+    """Places from a grip on the arrow along an axis to `length` further [m], shape (n, 3)."""
+    shares = np.concatenate([[0.0, 0.02], np.linspace(0.05, 1.0, 40)])
+    return start + np.outer(GRIP + shares * length, axis)
+
+
+def reddish(picture: np.ndarray) -> np.ndarray:
+    """Which pixels have the colour of tissue."""
+    r, g, b = picture.astype(int).transpose(2, 0, 1)
+    return (r > g + 25) & (r > b + 25) & (abs(g - b) < 60)
+
+
+def cut_coloured(picture: np.ndarray) -> np.ndarray:
+    """Which pixels have the colour of what a cut has opened."""
+    r, g, b = picture.astype(int).transpose(2, 0, 1)
+    return (r > 3 * g) & (r > 2 * b) & (r > 40)
+
+
+def use(browser: Browser, url: str, seen: Seen) -> None:
+    """The session that all tests of this file look at."""
+    scene = load_scene(SCENE)
+    positions = make_simulation(scene.tissue)[0].positions
+    page = browser.page(url)
+    page.wait(lambda: page.says('DISABLED'), 'the state')
+    eye = Eye(page, positions)
+
+    def keep(name: str) -> None:
+        left, top, width, height = eye.box.astype(int)
+        seen.texts[name] = page.evaluate('document.body.innerText')
+        seen.pictures[name] = page.picture()[top : top + height, left : left + width]
+        if folder := os.environ.get('PICTURES'):
+            page.save(Path(folder) / f'{name}.png')
+
+    page.wait(lambda: reddish(page.picture()).sum() > 5000, 'the tissue')
+    keep('before')
+    page.click('Record')
+    page.wait(lambda: page.says('Stop recording'), 'the recorder')
+    page.click('Start')
+    page.wait(lambda: page.says('ENABLED'), 'the force')
+    time.sleep(2.0)
+    tip = np.array(scene.arm.script.start.position)
+    page.drag(eye.pixels(way(tip, np.array([0.0, 0.0, 1.0]), -DOWN)))
+    time.sleep(1.0)
+    keep('pressed')
+    tip = tip - [0.0, 0.0, DOWN]
+    page.drag(eye.pixels(way(tip, np.array([1.0, 0.0, 0.0]), ALONG)))
+    time.sleep(1.0)
+    keep('cut')
+    page.open(url)
+    page.wait(lambda: page.says('ENABLED'), 'the page again')
+    page.wait(lambda: reddish(page.picture()).sum() > 5000, 'the tissue again')
+    time.sleep(1.0)
+    keep('reloaded')
+    page.click('E-STOP')
+    page.wait(lambda: page.says('emergency stop'), 'the stop')
+    keep('stopped')
+    page.click('Stop recording')
+    page.wait(lambda: page.says('Record') and not page.says('Stop recording'), 'the end of the bag')
+    seen.requests = page.requests
+
+
+@pytest.fixture(scope='module')
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
+    seen = Seen()
+    view = View(tmp_path_factory.mktemp('view'))
+    known = set((ROOT / 'bags' / 'sessions').glob('*'))
+    try:
+        url = view.url()
+        with chromium() as browser:
+            use(browser, url, seen)
+        (seen.bag,) = set((ROOT / 'bags' / 'sessions').glob('*')) - known
+        seen.status = view.end()
+    finally:
+        print(view.said)
+        if view.process.poll() is None:
+            view.end()
+    yield seen
+    subprocess.run(['rm', '-r', str(seen.bag)], check=True)
+
+
+@pytest.fixture(scope='module')
+def recording(seen: Seen) -> Recording:
+    return Recording(seen.bag)
+
+
+def test_view_ends_in_order_on_ctrl_c(seen: Seen) -> None:
+    assert seen.status == 0
+
+
+def test_page_asks_for_nothing_beyond_this_machine(seen: Seen) -> None:
+    assert seen.requests
+    for url in seen.requests:
+        assert url.startswith(('http://127.0.0.1:', 'ws://127.0.0.1:', 'data:', 'blob:')), url
+
+
+def test_tissue_is_drawn(seen: Seen) -> None:
+    before = seen.pictures['before']
+    assert 0.08 < reddish(before).mean() < 0.6
+    assert not cut_coloured(before).sum() > 50
+
+
+def test_dragged_blade_indents_the_tissue_and_then_cuts_it(recording: Recording) -> None:
+    times, states = recording.read('/tool/contact', ContactCodec(), 'state')
+    touched, inside = times[states[:, 0] == TOUCHING], times[states[:, 0] == INSIDE]
+    assert len(touched) and len(inside)
+    assert touched[0] < inside[0]
+    forces = recording.force(SERVO_CF)[1]
+    assert forces.max() > 0.3
+
+
+def test_what_is_cut_open_is_seen_in_its_own_colour(seen: Seen) -> None:
+    assert cut_coloured(seen.pictures['cut']).sum() > 100
+
+
+def test_a_reload_in_mid_session_shows_the_same_again(seen: Seen) -> None:
+    cut, again = seen.pictures['cut'], seen.pictures['reloaded']
+    assert cut_coloured(again).sum() > 0.5 * cut_coloured(cut).sum()
+    assert 'ENABLED' in seen.texts['reloaded']
+
+
+def test_e_stop_is_zero_force_and_fault_within_50_ms(recording: Recording) -> None:
+    commands = [
+        (recording.bag.read(m).string, m.publish_time)
+        for m in recording.messages('/haptic_bridge/state_command')
+    ]
+    clicked = recording.at(next(stamp for word, stamp in commands if word == E_STOP))
+    times, norms = recording.force(SERVO_CF)
+    assert norms[(times > clicked - 0.1) & (times <= clicked)].max() > 0
+    assert not norms[times > clicked + 0.05].any()
+    states: list[tuple[str, float]] = []
+    for message in recording.messages('/haptic_bridge/operating_state'):
+        states.append((recording.bag.read(message).state, recording.at(message.publish_time)))
+    fault = next(time for state, time in states if state == 'FAULT' and time > clicked)
+    assert fault - clicked < 0.05
+
+
+def test_hand_went_where_the_blade_was_dragged(recording: Recording) -> None:
+    poses: Any = [recording.bag.read(m).pose.position for m in recording.messages(MEASURED_CP)]
+    ways = np.array([(p.x, p.y, p.z) for p in poses])
+    moved = ways[-1] - ways[0]
+    assert moved[2] < -0.6 * DOWN
+    assert moved[0] > 0.6 * ALONG
+    assert abs(moved[1]) < 0.01

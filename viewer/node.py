@@ -1,0 +1,299 @@
+"""The node `viewer`: a page in the browser on a session that runs."""
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from cutting_trainer_msgs.msg import Contact, ForceSample
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from haptic_bridge.operating_state import E_STOP, State, crtk_types
+from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from haptic_bridge.wire import ContactCodec, PoseStampedCodec, StampedCodec, WrenchStampedCodec
+from tissue_sim import ros
+from tissue_sim.mesh_follower import MeshFollower
+from tissue_sim.scene_file import read_section
+from tissue_sim.settings import TissueSettings
+from tissue_sim.share import share_folder
+from tissue_sim.timing import PeriodicLoop
+from viewer.history import Counter
+from viewer.live_page import LivePage, SessionState
+from viewer.moment import Translator
+from viewer.page import addresses, open_page
+from viewer.panel import Actions, NodeState
+
+RATE = 30.0
+"""Updates of the page [Hz], at most."""
+_NICENESS = 10
+BRIDGE = 'haptic_bridge'
+
+
+class Stream:
+    """The newest message of a fast topic, and how many a second there are.
+
+    Args:
+        node: to subscribe with.
+        message_type, topic: of the messages.
+        codec: that reads them.
+    """
+
+    def __init__(self, node: Node, message_type: Any, topic: str, codec: StampedCodec) -> None:
+        self.newest: Any = None
+        self.counter = Counter()
+        self._codec = codec
+        self._subscription = ros.polled(node, message_type, topic, ros.NEWEST_BEST_EFFORT)
+
+    def poll(self, now: float) -> None:
+        """Takes what has come by a time [s]."""
+        if (taken := ros.take_numbered(self._subscription)) is not None:
+            self.newest = self._codec.decode(taken[0])
+            self.counter.see(now, taken[1])
+
+
+class ViewerNode(Node):
+    """Shows the graph and operates it; see docs/view.md.
+
+    Parameters:
+        scene: path of the scene file.
+        host, port: where the page is served; port 0: one that is free.
+        session: a launcher reads `message: ...` on standard output and answers on standard input,
+            so that nodes can be started again, and recorded.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('viewer')
+        scene = Path(self.declare_parameter('scene', '').value)
+        host = str(self.declare_parameter('host', '127.0.0.1').value)
+        port = int(self.declare_parameter('port', 8080).value)
+        self._launched = bool(self.declare_parameter('session', False).value)
+        self._take_scene(scene)
+        self._follower = MeshFollower(self)
+        self._contact = Stream(self, Contact, ros.CONTACT, ContactCodec())
+        self._wrench = Stream(self, WrenchStamped, f'{ros.ARM}/servo_cf', WrenchStampedCodec())
+        self._pose = Stream(self, PoseStamped, f'{ros.ARM}/measured_cp', PoseStampedCodec())
+        self._frames = Counter()
+        self._samples = ros.polled(self, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
+        self._connect()
+        self._state, self._nodes = '', dict[str, tuple[float, NodeState]]()
+        self._arm_state = ''
+        self._answers: list[SessionState] = []
+        actions = Actions(
+            start=self._start,
+            pause=self._pause,
+            e_stop=self._stop_at_once,
+            reset=lambda: self._ask('restart'),
+            record=lambda on: self._ask('record', on=on),
+            choose=lambda scene, method: self._ask('restart', scene=scene, method=method),
+            scale=self._scale,
+        )
+        self._server = open_page(host, port)
+        self._page = LivePage(
+            self._server, self._tool, actions, known_scenes(), self._guide, session=self._launched
+        )
+        self._loop = PeriodicLoop(RATE)
+        self._diagnostics = ros.Diagnostics(self, self._status)
+
+    def _take_scene(self, scene: Path) -> None:
+        device = read_section(scene, 'device', DeviceSettings)
+        self._translator = Translator(device)
+        self._tool = read_section(scene, 'tool', ToolSettings)
+        haptics = read_section(scene, 'haptics', HapticsSettings)
+        tissue = read_section(scene, 'tissue', TissueSettings)
+        self._nominal = haptics.rate, tissue.integration.rate
+        self._force_scale = haptics.force_scale
+
+    def _connect(self) -> None:
+        types = crtk_types()
+        self._command = types.command
+        self._to_bridge = self.create_publisher(
+            types.command, f'{BRIDGE}/state_command', ros.EVENTS
+        )
+        self._to_arm = self.create_publisher(types.command, f'{ros.ARM}/state_command', ros.EVENTS)
+        self._goal = self.create_publisher(PoseStamped, ros.HAND, ros.EVENTS)
+        self._parameters = self.create_client(SetParameters, f'{BRIDGE}/set_parameters')
+        for name, take in ((BRIDGE, self._bridge_state), (ros.ARM, self._arm_says)):
+            topic = f'{name}/operating_state'
+            self.create_subscription(types.operating_state, topic, take, ros.LATCHED)
+        self.create_subscription(DiagnosticArray, ros.DIAGNOSTICS, self._take_status, ros.EVENTS)
+
+    def work(self, stop: ros.Stop) -> None:
+        """Brings the page up to date, again and again."""
+        os.nice(_NICENESS)  # whoever looks on waits, not those who act
+        if self._launched:
+            threading.Thread(target=self._listen, daemon=True).start()
+        self._tell(page=addresses(self._server))
+        ros.announce_ready(self)
+        self._loop.start()
+        while not stop.is_set():
+            self._loop.wait()
+            self._tick(time.monotonic())
+
+    def close(self) -> None:
+        """Ends the page."""
+        self._server.stop()
+
+    def _tick(self, now: float) -> None:
+        try:
+            self._follower.poll()
+        except ValueError as error:
+            self.get_logger().warning(f'mesh refused: {error}', throttle_duration_sec=1.0)
+            self._follower.ask()
+        for stream in (self._contact, self._wrench, self._pose):
+            stream.poll(now)
+        if (taken := ros.take_numbered(self._samples)) is not None:
+            self._frames.see(now, taken[1])
+        while self._answers:
+            self._take_answer(self._answers.pop(0))
+        moment = None
+        if self._contact.newest is not None:
+            moment = self._translator.moment(
+                self._contact.newest, self._pose.newest, self._wrench.newest
+            )
+        rates = (
+            self._wrench.counter.rate(now) / self._nominal[0],
+            self._frames.rate(now) / self._nominal[1],
+        )
+        can_guide = self._state == State.ENABLED and self._goal.get_subscription_count() > 0
+        self._page.show(now, self._follower.replica, moment, rates, can_guide=can_guide)
+        self._page.show_state(self._state, self._said(now))
+        self._page.show_nodes(now, self._nodes_now(now))
+
+    # What operators do
+
+    def _start(self) -> None:
+        resume = 'resume' if self._state == State.PAUSED else 'enable'
+        self._send(self._to_arm, 'resume' if self._arm_state == State.PAUSED else 'enable')
+        self._send(self._to_bridge, resume)
+
+    def _pause(self) -> None:
+        self._send(self._to_bridge, 'pause')
+        self._send(self._to_arm, 'pause')
+
+    def _stop_at_once(self) -> None:
+        self._send(self._to_bridge, E_STOP)
+        self._send(self._to_arm, 'disable')
+
+    def _send(self, publisher: Any, word: str) -> None:
+        message = self._command(string=word)
+        message.header.stamp = self.get_clock().now().to_msg()
+        publisher.publish(message)
+
+    def _guide(self, position: Any, wxyz: Any) -> None:
+        """Gives the emulated hand a goal in the tissue frame."""
+        message = PoseStamped()
+        message.header.frame_id = ros.FRAME
+        message.header.stamp = self.get_clock().now().to_msg()
+        place, turn = message.pose.position, message.pose.orientation
+        place.x, place.y, place.z = map(float, position)
+        turn.w, turn.x, turn.y, turn.z = map(float, wxyz)
+        self._goal.publish(message)
+
+    def _scale(self, scale: float) -> None:
+        value = Parameter('force_scale', Parameter.Type.DOUBLE, float(scale))
+        request = SetParameters.Request(parameters=[value.to_parameter_msg()])
+        if not self._parameters.service_is_ready():
+            self._page.warn('the haptic bridge does not answer: the force scale stays')
+            return
+        self._parameters.call_async(request).add_done_callback(
+            lambda future: self._scaled(scale, future.result())
+        )
+
+    def _scaled(self, scale: float, response: Any) -> None:
+        result = response.results[0]
+        if result.successful:
+            self._force_scale = scale
+        else:
+            self._page.warn(f'force scale {scale:g} refused: {result.reason}')
+        self._page.show_scale(self._force_scale)
+
+    # Between the launcher and this node
+
+    def _ask(self, what: str, **details: object) -> None:
+        if self._launched:
+            self._tell(ask=what, **details)
+
+    def _tell(self, **content: object) -> None:
+        print(f'message: {json.dumps(content)}', flush=True)
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            self._answers.append(SessionState(**json.loads(line)))
+
+    def _take_answer(self, answer: SessionState) -> None:
+        if answer.scene_file:
+            self._take_scene(Path(answer.scene_file))
+            self._page.equip(self._tool)
+            self._page.show_scale(self._force_scale)
+        if answer.busy:
+            self._nodes.clear()
+        self._page.show_session(answer)
+
+    # What the nodes say
+
+    def _bridge_state(self, message: Any) -> None:
+        self._state = message.state
+
+    def _arm_says(self, message: Any) -> None:
+        self._arm_state = message.state
+
+    def _take_status(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            rate = float(values.get('rate', 0.0))
+            level = status.level[0]
+            state = NodeState(status.name, level, status.message, rate)
+            self._nodes[status.name] = (time.monotonic(), state)
+
+    def _nodes_now(self, now: float) -> list[NodeState]:
+        states = []
+        for name in sorted(self._nodes):
+            heard, state = self._nodes[name]
+            if now - heard > 3.0:
+                silent = f'silent for {now - heard:.0f} s'
+                state = state._replace(level=3, message=silent, rate=0.0)
+            states.append(state)
+        return states
+
+    def _said(self, now: float) -> str:
+        """What is to be said about the operating state."""
+        heard, bridge = self._nodes.get(BRIDGE, (0.0, None))
+        if bridge is None or now - heard > 3.0:
+            return 'The haptic bridge is silent.'
+        return (
+            {
+                State.ENABLED: 'Force is on. Drag the handles at the blade to move it.',
+                State.PAUSED: 'No force. Start goes on.',
+                State.DISABLED: 'No force. Start lets it in.',
+                State.FAULT: f'{bridge.message}. No force until Start.',
+            }.get(State(self._state), '')
+            if self._state
+            else ''
+        )
+
+    def _status(self) -> tuple[bytes, str, dict[str, object]]:
+        pages = len(self._server.get_clients())
+        values: dict[str, object] = dict(self._loop.report())
+        values |= {'pages': pages, 'revision_gaps': self._follower.gaps}
+        return DiagnosticStatus.OK, f'{pages} page{"s" * (pages != 1)}', values
+
+
+def known_scenes() -> list[str]:
+    """Names of the scenes that come with the trainer."""
+    return sorted(path.stem for path in (share_folder() / 'config' / 'scenes').glob('*.yaml'))
+
+
+def main() -> None:
+    """Runs the node."""
+    ros.run(ViewerNode, ViewerNode.work)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,178 @@
+"""What the page shows in three dimensions: the tissue, the tool, the proxy, the force."""
+
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from haptic_bridge.chain import INSIDE
+from haptic_bridge.settings import ToolSettings
+from tissue_sim.replica import MeshReplica
+from viewer.moment import Floats, Moment
+from viewer.surfaces import CUT, OUTER, DrawnTissue
+
+TISSUE, OPENED, OTHER_TISSUE = (205, 118, 100), (120, 8, 22), (120, 140, 190)
+BLADE, HANDLE, PROXY, FORCE = (178, 186, 196), (52, 60, 72), (40, 150, 90), (30, 90, 220)
+METRES_A_NEWTON = 0.02
+"""Length of the arrow by force."""
+FIELD_OF_VIEW = 0.9
+"""[rad] of the camera, upright."""
+_LEAST_FORCE = 0.02
+"""[N] below which no arrow is drawn."""
+_SPINE, _THICKNESS, _HANDLE = 0.005, 0.0008, 0.07
+"""[m] Width and thickness of the blade as drawn, length of the handle."""
+_NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
+
+
+class TissueView:
+    """The tissue in the scene of a page.
+
+    Args:
+        server: of the page.
+        name: in its scene.
+        colour: of the outside, 0 to 255.
+        offset: where it stands [m], shape (3,).
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        name: str,
+        colour: tuple[int, int, int] = TISSUE,
+        offset: tuple[float, ...] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self._server = server
+        self._drawn = DrawnTissue()
+        self._shown: tuple[object, int] = (None, -1)
+        looks: dict[int, dict[str, Any]] = {
+            OUTER: {'color': colour},
+            CUT: {'color': OPENED, 'flat_shading': True},
+        }
+        self._meshes = {
+            kind: server.scene.add_mesh_simple(
+                f'{name}/{kind}',
+                *_NOTHING,
+                position=offset,
+                visible=False,
+                **look,
+            )
+            for kind, look in looks.items()
+        }
+
+    def show(self, replica: MeshReplica) -> None:
+        """Brings the page up to the replica: positions, and faces where they have changed."""
+        now = (replica, replica.revision)
+        if now == self._shown or replica.revision < 0:
+            return
+        self._shown = now
+        others = self._drawn.follow(replica)
+        with self._server.atomic():
+            for kind, mesh in self._meshes.items():
+                faces = self._drawn.parts[kind].faces
+                if len(faces):
+                    mesh.vertices = self._drawn.positions(replica, kind)
+                if others:
+                    mesh.visible = bool(len(faces))
+                    mesh.faces = faces if len(faces) else _NOTHING[1]
+
+
+class Stage:
+    """Tool, proxy and force in the scene of a page, and the light on them.
+
+    Args:
+        server: of the page.
+        tool: as it is drawn.
+    """
+
+    def __init__(self, server: Any, tool: ToolSettings) -> None:
+        self._server = server
+        scene = server.scene
+        scene.set_up_direction('+z')
+        scene.add_grid(
+            '/floor', width=0.3, height=0.3, cell_size=0.01, section_size=0.05, plane='xy'
+        )
+        self._tool = scene.add_frame('/tool', show_axes=False, visible=False)
+        self._proxy = scene.add_icosphere('/proxy', radius=1.0, color=PROXY, opacity=0.6)
+        self._proxy.visible = False
+        self._arrow = scene.add_arrows(
+            '/force',
+            np.zeros((1, 2, 3), np.float32),
+            FORCE,
+            shaft_radius=0.0008,
+            head_radius=0.0022,
+            head_length=0.005,
+            visible=False,
+        )
+        self.equip(tool)
+
+    def equip(self, tool: ToolSettings) -> None:
+        """Draws another tool."""
+        scene = self._server.scene
+        for name, mesh, colour in (
+            ('blade', blade(tool), BLADE),
+            ('handle', handle(tool), HANDLE),
+        ):
+            vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+            scene.add_mesh_simple(f'/tool/{name}', vertices, faces, color=colour, flat_shading=True)
+        scene.add_icosphere('/tool/sphere', radius=tool.radius, color=BLADE, opacity=0.25)
+        self._proxy.scale = tool.radius
+
+    def look_at(self, tissue: MeshReplica) -> None:
+        """Puts the cameras of pages to come where the whole tissue is in view."""
+        camera = self._server.initial_camera
+        position, aim = framing(tissue.positions())
+        distance = float(np.linalg.norm(position - aim))
+        camera.fov, camera.near, camera.far = FIELD_OF_VIEW, 0.02 * distance, 50 * distance
+        camera.look_at, camera.position = tuple(aim), tuple(position)
+
+    def show(self, moment: Moment) -> None:
+        """Moves tool, proxy and arrow."""
+        norm = float(np.linalg.norm(moment.force))
+        with self._server.atomic():
+            self._tool.position, self._tool.wxyz = moment.tip, moment.turn
+            self._tool.visible = True
+            self._proxy.position = moment.proxy
+            self._proxy.visible = moment.contact != INSIDE
+            self._arrow.visible = norm >= _LEAST_FORCE
+            if norm >= _LEAST_FORCE:
+                self._arrow.points = arrow(moment)
+
+
+def framing(positions: Floats) -> tuple[Floats, Floats]:
+    """Where the camera stands, and at what it looks [m].
+
+    Args:
+        positions: of the tissue [m], shape (n, 3).
+    """
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    size = float(np.linalg.norm(high - low))
+    aim = (low + high) / 2 + [0.0, 0.0, 0.15 * size]  # the tool is above
+    return aim + size * np.array([0.3, -1.25, 0.9]), aim
+
+
+def arrow(moment: Moment) -> Floats:
+    """Begin and end of the arrow of the force [m], shape (1, 2, 3)."""
+    return np.stack([moment.tip, moment.tip + METRES_A_NEWTON * moment.force])[None]
+
+
+def blade(tool: ToolSettings) -> Any:
+    """The blade, in the tool frame: its edge from root to tip, its spine behind it."""
+    root, tip = np.array(tool.blade_root), np.array(tool.blade_tip)
+    along = (tip - root) / np.linalg.norm(tip - root)
+    back = -np.eye(3)[int(np.argmin(np.abs(along)))]  # it cuts along +x where it can
+    back -= along * (back @ along)
+    back /= np.linalg.norm(back)
+    side = np.cross(along, back) * _THICKNESS / 2
+    shoulder = tip - along * _SPINE
+    spine = np.stack([root, shoulder]) + back * _SPINE
+    edge = np.stack([root, tip])
+    return trimesh.convex.convex_hull(np.concatenate([edge, spine + side, spine - side]))
+
+
+def handle(tool: ToolSettings) -> Any:
+    """The handle, in the tool frame, behind the blade's root."""
+    root, tip = np.array(tool.blade_root), np.array(tool.blade_tip)
+    along = (root - tip) / np.linalg.norm(root - tip)
+    return trimesh.creation.cylinder(
+        radius=0.0035, segment=np.stack([root, root + along * _HANDLE]), sections=24
+    )
