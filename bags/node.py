@@ -30,6 +30,7 @@ from tissue_sim.ros import (
     FORCE,
     FRAME_INPUTS,
     LATCHED,
+    MARKERS,
     MESH,
     MESH_UPDATES,
     STREAM,
@@ -120,6 +121,7 @@ class Recorder(Node):
         self.writer = BagWriter(Path(folder), custom_data=_custom_data(scene, seed))
         self._streams: dict[str, _Stream] = {}
         self._unrecorded: dict[str, str] = {}
+        self._drawings = self.resolve_topic_name(MARKERS)
         self._closed = False
         self._collector = ParameterCollector(self)
         self._depths = {
@@ -131,6 +133,9 @@ class Recorder(Node):
         """Subscribes to topics that have got their first publisher since the last time."""
         for topic, types in self.get_topic_names_and_types():
             if topic not in self._streams and topic not in self._unrecorded:
+                if topic == self._drawings:
+                    self._unrecorded[topic] = 'it is drawn from what is recorded'
+                    continue
                 self._start(topic, types[0])
 
     def review(self) -> None:

@@ -38,8 +38,8 @@ class OperatingStateMachine:
     """The states of one device or bridge that needs no homing motion. Threads may share it.
 
     FAULT is entered when something is wrong, and by `E_STOP`; none of CRTK's commands leads there.
-    It stays until `enable` or `disable` retries. `enable` succeeds when `cause` says that nothing is
-    wrong.
+    It stays until `enable` or `disable` retries; `enable` succeeds when `cause` says that nothing
+    is wrong.
 
     Args:
         cause: why force is impossible now, as a sentence, or '' when nothing is wrong. Asked before

@@ -27,7 +27,7 @@ from session.scene import load_scene
 from tissue_sim.assembly import make_simulation
 from viewer.stage import FIELD_OF_VIEW, framing
 
-pytestmark = [pytest.mark.slow, pytest.mark.real_time, needs_chromium]
+pytestmark = [pytest.mark.slow, needs_chromium]
 
 ROOT = Path(__file__).resolve().parents[1]
 GRIP = 0.028
@@ -125,6 +125,7 @@ def cut_coloured(picture: np.ndarray) -> np.ndarray:
 
 def use(browser: Browser, url: str, seen: Seen) -> None:
     """The session that all tests of this file look at."""
+    began = time.monotonic()
     scene = load_scene(SCENE)
     positions = make_simulation(scene.tissue)[0].positions
     page = browser.page(url)
@@ -133,6 +134,7 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
 
     def keep(name: str) -> None:
         left, top, width, height = eye.box.astype(int)
+        print(f'{time.monotonic() - began:.1f} s: {name}', flush=True)
         seen.texts[name] = page.evaluate('document.body.innerText')
         seen.pictures[name] = page.picture()[top : top + height, left : left + width]
         if folder := os.environ.get('PICTURES'):

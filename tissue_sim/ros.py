@@ -27,6 +27,8 @@ CUT = 'cutting/cut'
 ARM = 'arm'
 HAND = f'{ARM}/hand/servo_cp'
 DIAGNOSTICS = '/diagnostics'
+MARKERS = 'viewer/markers'
+STATIC_FRAMES = '/tf_static'
 
 
 def _reliable(depth: int, *, latched: bool = False) -> QoSProfile:

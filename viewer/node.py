@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from cutting_trainer_msgs.msg import Contact, ForceSample
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from visualization_msgs.msg import MarkerArray
 
 from haptic_bridge.operating_state import E_STOP, State, crtk_types
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
@@ -24,12 +25,21 @@ from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
 from tissue_sim.share import share_folder
 from tissue_sim.timing import PeriodicLoop
+from viewer.frames import device_frame
 from viewer.history import Counter
 from viewer.live_page import LivePage, SessionState
-from viewer.moment import Translator
+from viewer.markers import Colouring, Markers
+from viewer.moment import Moment, Translator
 from viewer.page import addresses, open_page
 from viewer.panel import Actions, NodeState
 
+try:
+    from tf2_msgs.msg import TFMessage
+except ModuleNotFoundError:  # it is not among the wheels
+    TFMessage = None
+
+MARKER_PERIOD = 0.1
+"""[s] between two sets of markers."""
 RATE = 30.0
 """Updates of the page [Hz], at most."""
 _NICENESS = 10
@@ -64,6 +74,8 @@ class ViewerNode(Node):
     Parameters:
         scene: path of the scene file.
         host, port: where the page is served; port 0: one that is free.
+        marker_colour: of the tissue in `viewer/markers`: displacement or von_mises.
+        marker_largest: what has the last colour; [m] or [Pa].
         session: a launcher reads `message: ...` on standard output and answers on standard input,
             so that nodes can be started again, and recorded.
     """
@@ -73,6 +85,14 @@ class ViewerNode(Node):
         scene = Path(self.declare_parameter('scene', '').value)
         host = str(self.declare_parameter('host', '127.0.0.1').value)
         port = int(self.declare_parameter('port', 8080).value)
+        colouring = str(self.declare_parameter('marker_colour', 'displacement').value)
+        if colouring not in get_args(Colouring):
+            known = ' or '.join(get_args(Colouring))
+            raise ValueError(f'marker_colour is {colouring!r}: use {known}')
+        largest = float(self.declare_parameter('marker_largest', 0.01).value)
+        if not largest > 0:
+            raise ValueError(f'marker_largest is {largest}: use a number above 0')
+        self._colouring: tuple[Any, float] = colouring, largest
         self._launched = bool(self.declare_parameter('session', False).value)
         self._take_scene(scene)
         self._follower = MeshFollower(self)
@@ -99,6 +119,7 @@ class ViewerNode(Node):
             self._server, self._tool, actions, known_scenes(), self._guide, session=self._launched
         )
         self._loop = PeriodicLoop(RATE)
+        self._next_markers = 0.0
         self._diagnostics = ros.Diagnostics(self, self._status)
 
     def _take_scene(self, scene: Path) -> None:
@@ -109,6 +130,10 @@ class ViewerNode(Node):
         tissue = read_section(scene, 'tissue', TissueSettings)
         self._nominal = haptics.rate, tissue.integration.rate
         self._force_scale = haptics.force_scale
+        material = tissue.material
+        elasticity = material.youngs_modulus, material.poissons_ratio
+        self._markers = Markers(ros.FRAME, *self._colouring, *elasticity)
+        self._frame = device_frame(device)
 
     def _connect(self) -> None:
         types = crtk_types()
@@ -118,7 +143,14 @@ class ViewerNode(Node):
         )
         self._to_arm = self.create_publisher(types.command, f'{ros.ARM}/state_command', ros.EVENTS)
         self._goal = self.create_publisher(PoseStamped, ros.HAND, ros.EVENTS)
-        self._parameters = self.create_client(SetParameters, f'{BRIDGE}/set_parameters')
+        self._setter = self.create_client(SetParameters, f'{BRIDGE}/set_parameters')
+        self._marker_array = self.create_publisher(MarkerArray, ros.MARKERS, ros.EVENTS)
+        if TFMessage is None:
+            self.get_logger().info('tf2_msgs is not installed: /tf_static is not published')
+        else:
+            self._static = self.create_publisher(TFMessage, ros.STATIC_FRAMES, ros.LATCHED)
+            self._frame.header.stamp = self.get_clock().now().to_msg()
+            self._static.publish(TFMessage(transforms=[self._frame]))
         for name, take in ((BRIDGE, self._bridge_state), (ros.ARM, self._arm_says)):
             topic = f'{name}/operating_state'
             self.create_subscription(types.operating_state, topic, take, ros.LATCHED)
@@ -165,6 +197,17 @@ class ViewerNode(Node):
         self._page.show(now, self._follower.replica, moment, rates, can_guide=can_guide)
         self._page.show_state(self._state, self._said(now))
         self._page.show_nodes(now, self._nodes_now(now))
+        self._publish_markers(now, moment)
+
+    def _publish_markers(self, now: float, moment: Moment | None) -> None:
+        """Ten times a second, where somebody listens."""
+        replica = self._follower.replica
+        if now < self._next_markers or replica.revision < 0:
+            return
+        if self._marker_array.get_subscription_count() > 0:
+            self._next_markers = now + MARKER_PERIOD
+            data = self._markers.array(replica, moment, self._tool.radius, time.time_ns())
+            self._marker_array.publish(data)
 
     # What operators do
 
@@ -199,10 +242,10 @@ class ViewerNode(Node):
     def _scale(self, scale: float) -> None:
         value = Parameter('force_scale', Parameter.Type.DOUBLE, float(scale))
         request = SetParameters.Request(parameters=[value.to_parameter_msg()])
-        if not self._parameters.service_is_ready():
+        if not self._setter.service_is_ready():
             self._page.warn('the haptic bridge does not answer: the force scale stays')
             return
-        self._parameters.call_async(request).add_done_callback(
+        self._setter.call_async(request).add_done_callback(
             lambda future: self._scaled(scale, future.result())
         )
 
