@@ -13,7 +13,7 @@ setup(
     description='Teleoperated soft-tissue cutting trainer for ROS 2',
     license='Apache-2.0',
     python_requires='>=3.11,<3.14',
-    packages=['tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session'],
+    packages=['tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'viewer', 'session'],
     # Lower bounds: the launcher pins exactly, a library must not.
     install_requires=[
         line.replace('==', '>=') for line in REQUIREMENTS if line and not line.startswith('#')

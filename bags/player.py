@@ -28,13 +28,14 @@ class Playhead:
     Attributes:
         paused: it stands still.
         rounds: how often it has begun again.
+        rate: seconds of the session in one second; may be changed.
     """
 
     def __init__(self, start: float, end: float, *, rate: float = 1.0, loop: bool = False) -> None:
         self.paused = True
         self.rounds = 0
         self._start, self._end = start, end
-        self._rate, self._loop = rate, loop
+        self.rate, self._loop = rate, loop
         self._position = start
         self._since: float | None = None
 
@@ -51,7 +52,7 @@ class Playhead:
     def move(self, now: float) -> float:
         """Goes on to a time of the caller's clock [s]; returns the position [s]."""
         if not self.paused and self._since is not None:
-            self._position += (now - self._since) * self._rate
+            self._position += (now - self._since) * self.rate
         self._since = now
         if self._position >= self._end:
             self.rounds += self._loop
@@ -61,6 +62,10 @@ class Playhead:
     def toggle(self) -> None:
         """Pauses, or goes on."""
         self.paused = not self.paused
+
+    def seek(self, position: float) -> None:
+        """Goes to a position [s]."""
+        self._position = min(max(position, self._start), self._end)
 
     def step(self) -> None:
         """Pauses, one frame further on."""

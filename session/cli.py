@@ -78,6 +78,17 @@ def view(
     attach: Annotated[
         bool, typer.Option('--attach', help='Show the graph that runs already; start no session.')
     ] = False,
+    bag: Annotated[
+        Path | None,
+        typer.Option(help='Folder of a bag: show that, with a time line, instead of a session.'),
+    ] = None,
+    resimulate: Annotated[
+        bool, typer.Option('--resimulate', help='Compute the bag again, and show that beside it.')
+    ] = False,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option('--with', help='key=value that is otherwise then (as in resimulate).'),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help='Seed of everything random.')] = 0,
     domain: Annotated[
         str,
@@ -88,6 +99,14 @@ def view(
     from session.domain import parse_domain
     from session.view import ViewOptions, run_view
 
+    if bag is not None:
+        from session.recorded_scene import parse_changes
+        from session.view_bag import ReplayOptions, view_bag
+
+        replayed = ReplayOptions(bag, resimulate, parse_changes(changes or []), host, port)
+        raise typer.Exit(int(view_bag(replayed)))
+    if resimulate or changes:
+        raise typer.BadParameter('--resimulate and --with need a --bag')
     options = ViewOptions(scene, host, port, attach, seed, parse_domain(domain))
     raise typer.Exit(int(run_view(options)))
 
@@ -458,8 +477,10 @@ def _is_users(error: ValueError) -> bool:
     from haptic_bridge.settings import SettingsError
     from session.errors import SessionError
     from tissue_sim.errors import MeshError, SceneError
+    from viewer.page import PageError
 
-    return isinstance(error, SessionError | SceneError | MeshError | SettingsError | BagError)
+    known = SessionError | SceneError | MeshError | SettingsError | BagError | PageError
+    return isinstance(error, known)
 
 
 if __name__ == '__main__':

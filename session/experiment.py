@@ -146,7 +146,7 @@ def run_experiment(bag: Bag, scene: Scene, computed: Recomputation) -> Run:
         raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
     hand = Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))
     substeps = diverged = 0
-    untils = [_time_of_contact(record) for record in read_frames(bag)]
+    untils = [time_of_contact(record) for record in read_frames(bag)]
     for frame, _ in closed_loop(poses, untils, hand, computed):
         substeps += frame.substeps
         diverged += frame.diverged
@@ -189,7 +189,7 @@ def closed_loop(
         yield frame, answer
 
 
-def _time_of_contact(record: FrameRecord) -> int:
+def time_of_contact(record: FrameRecord) -> int:
     """Stamp of the pose [ns] that a frame has seen last."""
     return record.pose.stamp_ns if record.pose is not None else record.time - _FRAME_NS
 

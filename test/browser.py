@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -20,12 +21,15 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from PIL import Image
+from matplotlib import image
 from websockets.sync.client import connect
+
+from session import child
 
 SIZE = (1060, 640)
 PATIENCE = 60.0
-_CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+_NAMES = ('chromium', 'chromium-browser', 'google-chrome')
+_CHROMIUM = next(filter(None, map(shutil.which, _NAMES)), None)
 needs_chromium = pytest.mark.skipif(
     _CHROMIUM is None, reason='chromium is not installed: sudo apt install chromium'
 )
@@ -69,11 +73,11 @@ class Page:
     def picture(self) -> np.ndarray:
         """What is seen, shape (height, width, 3), 0 to 255."""
         data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
-        return np.array(Image.open(io.BytesIO(data)).convert('RGB'))
+        return np.rint(255 * image.imread(io.BytesIO(data))[..., :3]).astype(np.uint8)
 
     def save(self, file: Path) -> None:
         """Writes what is seen as PNG."""
-        Image.fromarray(self.picture()).save(file)
+        image.imsave(file, self.picture())
 
     def mouse(self, kind: str, x: float, y: float, *, pressed: bool = False) -> None:
         """One event of the mouse at a place [pixel]."""
@@ -166,7 +170,9 @@ def chromium() -> Iterator[Browser]:
     """A browser with a profile of its own, that reaches this machine only; gone in the end."""
     assert _CHROMIUM is not None
     with tempfile.TemporaryDirectory(prefix='chromium-', ignore_cleanup_errors=True) as profile:
-        command = [_CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
+        # Bound to this process, whatever ends it.
+        command = [sys.executable, '-I', '-S', child.__file__, str(os.getpid()), '9']
+        command += [_CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
         command += [f'--user-data-dir={profile}', '--no-first-run', '--disable-extensions']
         command += ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--mute-audio']
         command += ['--disable-background-networking', '--disable-dev-shm-usage']

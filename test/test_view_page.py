@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser, Page, chromium, needs_chromium
-from live import MEASURED_CP, SERVO_CF, Recording, free_domain
+from live import MEASURED_CP, SERVO_CF, Recording, free_domain, two_presses, write_scene
 
 from haptic_bridge.chain import INSIDE, TOUCHING
 from haptic_bridge.operating_state import E_STOP
@@ -32,9 +32,8 @@ pytestmark = [pytest.mark.slow, needs_chromium]
 ROOT = Path(__file__).resolve().parents[1]
 GRIP = 0.028
 """[m] from the tip to where the arrows of the handles are gripped."""
-DOWN, ALONG = 0.050, 0.035
-"""[m] that the blade is dragged."""
-SCENE = 'liver'
+DOWN, ALONG = 0.025, 0.026
+"""[m] that the blade is dragged: some 5 mm into a block that is 10 mm high, and through it."""
 
 
 @dataclass
@@ -51,12 +50,12 @@ class Seen:
 class View:
     """`trainer view` as a process of its own."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, scene: Path) -> None:
         self._said = folder / 'said'
-        command = [sys.executable, '-m', 'session.cli', 'view', '--scene', SCENE, '--port', '0']
+        command = [sys.executable, '-m', 'session.cli', 'view', '--port', '0']
         with self._said.open('wb') as file:
             self.process = subprocess.Popen(
-                [*command, '--domain', str(free_domain())],
+                [*command, '--scene', str(scene), '--domain', str(free_domain())],
                 cwd=ROOT,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
@@ -123,10 +122,22 @@ def cut_coloured(picture: np.ndarray) -> np.ndarray:
     return (r > 3 * g) & (r > 2 * b) & (r > 40)
 
 
-def use(browser: Browser, url: str, seen: Seen) -> None:
+def start(page: Page) -> None:
+    """Lets the force in; again where a machine that stood still has made a fault."""
+    for _ in range(10):
+        page.click('Start')
+        deadline = time.monotonic() + 3.0
+        while time.monotonic() < deadline:
+            if page.says('ENABLED'):
+                return
+            time.sleep(0.1)
+    raise AssertionError(page.evaluate('document.body.innerText'))
+
+
+def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     """The session that all tests of this file look at."""
     began = time.monotonic()
-    scene = load_scene(SCENE)
+    scene = load_scene(str(file))
     positions = make_simulation(scene.tissue)[0].positions
     page = browser.page(url)
     page.wait(lambda: page.says('DISABLED'), 'the state')
@@ -140,12 +151,12 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
         if folder := os.environ.get('PICTURES'):
             page.save(Path(folder) / f'{name}.png')
 
-    page.wait(lambda: reddish(page.picture()).sum() > 5000, 'the tissue')
+    page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue')
     keep('before')
     page.click('Record')
     page.wait(lambda: page.says('Stop recording'), 'the recorder')
-    page.click('Start')
-    page.wait(lambda: page.says('ENABLED'), 'the force')
+    start(page)
+    page.wait(lambda: page.says('Drag the handles'), 'the handles')
     time.sleep(2.0)
     tip = np.array(scene.arm.script.start.position)
     page.drag(eye.pixels(way(tip, np.array([0.0, 0.0, 1.0]), -DOWN)))
@@ -157,7 +168,7 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
     keep('cut')
     page.open(url)
     page.wait(lambda: page.says('ENABLED'), 'the page again')
-    page.wait(lambda: reddish(page.picture()).sum() > 5000, 'the tissue again')
+    page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue again')
     time.sleep(1.0)
     keep('reloaded')
     page.click('E-STOP')
@@ -171,12 +182,14 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
 @pytest.fixture(scope='module')
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
     seen = Seen()
-    view = View(tmp_path_factory.mktemp('view'))
+    folder = tmp_path_factory.mktemp('view')
+    scene = write_scene(folder, two_presses(), 20.0, cut_threshold=0.4)
+    view = View(folder, scene)
     known = set((ROOT / 'bags' / 'sessions').glob('*'))
     try:
         url = view.url()
         with chromium() as browser:
-            use(browser, url, seen)
+            use(browser, url, scene, seen)
         (seen.bag,) = set((ROOT / 'bags' / 'sessions').glob('*')) - known
         seen.status = view.end()
     finally:
@@ -204,7 +217,7 @@ def test_page_asks_for_nothing_beyond_this_machine(seen: Seen) -> None:
 
 def test_tissue_is_drawn(seen: Seen) -> None:
     before = seen.pictures['before']
-    assert 0.08 < reddish(before).mean() < 0.6
+    assert 0.02 < reddish(before).mean() < 0.6
     assert not cut_coloured(before).sum() > 50
 
 

@@ -74,7 +74,8 @@ class LivePage:
         self._history = History(4, _SAMPLES)
         self._gauge: DepthGauge | None = None
         self._next_plot = self._next_table = 0.0
-        self._said = self._warning = self._busy = ''
+        self._said = ('', '')
+        self._warning = self._busy = ''
         self._now = self._warned = 0.0
 
     def equip(self, tool: ToolSettings) -> None:

@@ -153,10 +153,10 @@ class Plots:
     """
 
     def __init__(self, gui: Any) -> None:
-        self._force = _Plot(gui, 'Force on the hand [N]', {'force': '#1c7ed6'}, 0.5)
-        self._depth = _Plot(gui, 'Depth of the blade [mm]', {'depth': '#c2255c'}, 5.0)
+        self._force = TimePlot(gui, 'Force on the hand [N]', {'force': '#1c7ed6'}, 0.5)
+        self._depth = TimePlot(gui, 'Depth of the blade [mm]', {'depth': '#c2255c'}, 5.0)
         rates = {'force loop': '#1c7ed6', 'tissue': '#e8590c'}
-        self._rates = _Plot(gui, 'Rates [% of nominal]', rates, 120.0)
+        self._rates = TimePlot(gui, 'Rates [% of nominal]', rates, 120.0)
 
     def show(self, rows: Floats) -> None:
         """Shows a history.
@@ -172,11 +172,26 @@ class Plots:
         self._rates.show(time, 1e2 * rows[:, 3], 1e2 * rows[:, 4])
 
 
-class _Plot:
-    """Lines over time, from zero to a top that grows in steps."""
+class TimePlot:
+    """Lines over time, from zero to a top that grows in steps.
 
-    def __init__(self, gui: Any, title: str, lines: Mapping[str, str], least: float) -> None:
-        self._least, self._top = least, 0.0
+    Args:
+        gui: of the page.
+        title: with the unit.
+        lines: colour by name.
+        least: smallest top.
+        span: of the time [s].
+    """
+
+    def __init__(
+        self,
+        gui: Any,
+        title: str,
+        lines: Mapping[str, str],
+        least: float,
+        span: tuple[float, float] = (-PLOTTED, 0.0),
+    ) -> None:
+        self._least, self._top, self._span = least, 0.0, span
         series: list[dict[str, Any]] = [{'label': 't [s]'}]
         series += [
             {'label': name, 'stroke': colour, 'width': 2, 'points': {'show': False}}
@@ -191,14 +206,15 @@ class _Plot:
             height=130 if len(lines) == 1 else 160,
         )
 
-    def show(self, time: Floats, *lines: Floats) -> None:
+    def show(self, time: Floats, *lines: Floats, mark: Floats | None = None) -> None:
+        """Draws the lines; a mark stands beside them without a say in the scale."""
         wanted = max(self._least, *(float(line.max()) for line in lines))
         top = self._least * 2.0 ** np.ceil(np.log2(wanted / self._least))
         if top != self._top:
             self._top = top
-            span = {'time': False, 'range': (-PLOTTED, 0.0)}
-            self._plot.scales = {'x': span, 'y': {'range': (0.0, top)}}
-        self._plot.data = (time, *lines)
+            time_axis = {'time': False, 'range': self._span}
+            self._plot.scales = {'x': time_axis, 'y': {'range': (0.0, top)}}
+        self._plot.data = (time, *lines) if mark is None else (time, *lines, mark)
 
 
 def _async(action: Callable[[], None]) -> Any:

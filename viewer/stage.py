@@ -9,7 +9,7 @@ from haptic_bridge.chain import INSIDE
 from haptic_bridge.settings import ToolSettings
 from tissue_sim.replica import MeshReplica
 from viewer.moment import Floats, Moment
-from viewer.surfaces import CUT, OUTER, DrawnTissue
+from viewer.surfaces import CUT, OUTER, DrawnTissue, Surface
 
 TISSUE, OPENED, OTHER_TISSUE = (205, 118, 100), (120, 8, 22), (120, 140, 190)
 BLADE, HANDLE, PROXY, FORCE = (178, 186, 196), (52, 60, 72), (40, 150, 90), (30, 90, 220)
@@ -59,7 +59,7 @@ class TissueView:
             for kind, look in looks.items()
         }
 
-    def show(self, replica: MeshReplica) -> None:
+    def show(self, replica: Surface) -> None:
         """Brings the page up to the replica: positions, and faces where they have changed."""
         now = (replica, replica.revision)
         if now == self._shown or replica.revision < 0:
@@ -117,10 +117,14 @@ class Stage:
         scene.add_icosphere('/tool/sphere', radius=tool.radius, color=BLADE, opacity=0.25)
         self._proxy.scale = tool.radius
 
-    def look_at(self, tissue: MeshReplica) -> None:
-        """Puts the cameras of pages to come where the whole tissue is in view."""
+    def look_at(self, tissue: MeshReplica, *, beside: bool = False) -> None:
+        """Puts the cameras of pages to come where the tissue is in view, or two of it."""
         camera = self._server.initial_camera
-        position, aim = framing(tissue.positions())
+        positions = tissue.positions()
+        if beside:
+            further = positions + np.array([1.25 * np.ptp(positions[:, 0]), 0.0, 0.0])
+            positions = np.concatenate([positions, further])
+        position, aim = framing(positions)
         distance = float(np.linalg.norm(position - aim))
         camera.fov, camera.near, camera.far = FIELD_OF_VIEW, 0.02 * distance, 50 * distance
         camera.look_at, camera.position = tuple(aim), tuple(position)

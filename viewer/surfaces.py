@@ -1,11 +1,9 @@
 """The tissue's surface as the parts that are drawn: the organ's outside, and what cuts opened."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-from tissue_sim.replica import MeshReplica
 
 OUTER, CUT = 0, 1
 """Kinds of triangles, as in `Mesh`."""
@@ -35,6 +33,34 @@ def part(triangles: NDArray[np.int32], kinds: NDArray[np.uint8], kind: int) -> P
     return Part(nodes.astype(np.int64), faces.reshape(-1, 3).astype(np.uint32))
 
 
+class Surface(Protocol):
+    """A tissue as far as it is drawn: a `MeshReplica`, or whatever has the same fields."""
+
+    @property
+    def rest(self) -> NDArray[np.float64]:
+        """[m], shape (n, 3)."""
+
+    @property
+    def displacement(self) -> NDArray[Any]:
+        """[m], shape (n, 3)."""
+
+    @property
+    def triangles(self) -> NDArray[np.int32]:
+        """Node indices, shape (k, 3)."""
+
+    @property
+    def triangle_kind(self) -> NDArray[np.uint8]:
+        """OUTER or CUT, shape (k,)."""
+
+    @property
+    def topology(self) -> int:
+        """Counts changes of connectivity."""
+
+    @property
+    def revision(self) -> int:
+        """Counts changes of any kind."""
+
+
 class DrawnTissue:
     """What a page draws of a replica: faces when they change, positions in every frame.
 
@@ -46,17 +72,17 @@ class DrawnTissue:
         self.parts: dict[int, Part] = {}
         self._known: tuple[object, int] = (None, -1)
 
-    def follow(self, replica: MeshReplica) -> bool:
+    def follow(self, replica: Surface) -> bool:
         """Takes the replica's connectivity; whether the faces are others than before."""
-        known = (replica, replica.topology)
-        if known == self._known and self.parts:
-            return False
-        self._known = known
         triangles, kinds = replica.triangles, replica.triangle_kind
+        base = triangles if triangles.base is None else triangles.base
+        if self.parts and self._known[0] is base and self._known[1] == replica.topology:
+            return False
+        self._known = base, replica.topology
         self.parts = {kind: part(triangles, kinds, kind) for kind in (OUTER, CUT)}
         return True
 
-    def positions(self, replica: MeshReplica, kind: int) -> NDArray[np.float32]:
+    def positions(self, replica: Surface, kind: int) -> NDArray[np.float32]:
         """Of a part's nodes now [m], shape (n, 3)."""
         nodes = self.parts[kind].nodes
         return (replica.rest[nodes] + replica.displacement[nodes]).astype(np.float32)
