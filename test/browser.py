@@ -27,7 +27,8 @@ from websockets.sync.client import connect
 from session import child
 
 SIZE = (1060, 640)
-PATIENCE = 60.0
+PATIENCE = 150.0
+"""[s] that a shared machine without a graphics card may need for anything."""
 _NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 _CHROMIUM = next(filter(None, map(shutil.which, _NAMES)), None)
 needs_chromium = pytest.mark.skipif(

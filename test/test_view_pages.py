@@ -1,0 +1,139 @@
+"""Claims about what a page's server sends: how much, when, and to whom."""
+
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pages import OpenPage
+
+from viewer.page import PageError, addresses, is_local, open_page
+from viewer.panel import METHODS
+from viewer.stage import TissueView
+
+SIDE = 100
+"""Squares along an edge of a sheet of 20,000 triangles."""
+FRAMES = 240
+
+
+@pytest.fixture
+def server() -> Iterator[Any]:
+    server = open_page('127.0.0.1', 0)
+    yield server
+    server.stop()
+
+
+def url(server: Any) -> str:
+    return addresses(server)
+
+
+def sheet() -> SimpleNamespace:
+    """A tissue as far as it is drawn: a flat sheet."""
+    line = np.linspace(0.0, 0.1, SIDE + 1)
+    x, y = np.meshgrid(line, line)
+    rest = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    a = (np.arange(SIDE)[:, None] * (SIDE + 1) + np.arange(SIDE)).ravel()
+    b, c, d = a + 1, a + SIDE + 1, a + SIDE + 2
+    triangles = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
+    return SimpleNamespace(
+        rest=rest,
+        displacement=np.zeros_like(rest),
+        triangles=triangles,
+        triangle_kind=np.zeros(len(triangles), np.uint8),
+        topology=0,
+        revision=0,
+    )
+
+
+def wave(tissue: SimpleNamespace) -> None:
+    """The next frame."""
+    tissue.revision += 1
+    tissue.displacement[:, 2] = 1e-5 * tissue.revision
+
+
+def shown(view: TissueView, tissue: SimpleNamespace, period: float) -> float:
+    """Shows frames one after the other; returns how long the showing took [s]."""
+    busy = 0.0
+    for _ in range(FRAMES):
+        wave(tissue)
+        began = time.perf_counter()
+        view.show(tissue)
+        busy += time.perf_counter() - began
+        time.sleep(period)
+    return busy
+
+
+def wait_for_newest(page: OpenPage, tissue: SimpleNamespace) -> None:
+    deadline = time.monotonic() + 30
+    wanted = np.float32(tissue.displacement[0, 2])
+    while page.newest is None or page.newest[0, 2] != wanted:
+        assert time.monotonic() < deadline, 'the newest frame never came'
+        time.sleep(0.02)
+
+
+def test_a_page_that_does_not_read_slows_only_itself_and_then_gets_the_newest(server: Any) -> None:
+    tissue, view = sheet(), TissueView(server, '/tissue')
+    view.show(tissue)
+    alone = shown(view, tissue, 0.004)
+    fast, stuck = OpenPage(url(server)), OpenPage(url(server), reads=False)
+    wait_for_newest(fast, tissue)
+    before = fast.updates
+    beside = shown(view, tissue, 0.004)
+    wait_for_newest(fast, tissue)
+    assert fast.updates - before > 10
+    assert beside < 5 * alone + 0.5  # it waits for nobody
+    assert stuck.windows == 0
+    stuck.read()
+    wait_for_newest(stuck, tissue)
+    assert stuck.updates < FRAMES  # what lay between was dropped, not kept for it
+    fast.close()
+    stuck.close()
+
+
+def test_faces_are_sent_only_when_the_connectivity_changes(server: Any) -> None:
+    sent: list[Any] = []
+    queue = server._websock_server.queue_message
+    server._websock_server.queue_message = lambda message: (sent.append(message), queue(message))
+    tissue, view = sheet(), TissueView(server, '/tissue')
+    for _ in range(5):
+        wave(tissue)
+        view.show(tissue)
+    view.show(tissue)  # nothing new
+    tissue.triangles, tissue.topology = tissue.triangles[:-10].copy(), 1
+    tissue.triangle_kind = np.repeat([0, 1], [len(tissue.triangles) - 50, 50]).astype(np.uint8)
+    wave(tissue)
+    view.show(tissue)
+    updates = [message.updates for message in sent if hasattr(message, 'updates')]
+    assert sum('vertices' in update for update in updates) == 5 + 2
+    assert sum('faces' in update for update in updates) == 1 + 2
+    positions = next(update['vertices'] for update in updates if 'vertices' in update)
+    assert positions.dtype == np.float32
+
+
+def test_a_page_that_comes_late_gets_the_whole_scene(server: Any) -> None:
+    tissue, view = sheet(), TissueView(server, '/tissue')
+    view.show(tissue)
+    wave(tissue)
+    view.show(tissue)
+    page = OpenPage(url(server))
+    wait_for_newest(page, tissue)
+    page.close()
+
+
+def test_page_is_for_this_machine_alone_unless_it_says_otherwise(server: Any) -> None:
+    assert url(server).startswith('http://127.0.0.1:')
+    assert is_local('127.0.0.1') and is_local('::1') and is_local('localhost')
+    assert not is_local('0.0.0.0') and not is_local('192.168.1.4')
+    said = addresses(SimpleNamespace(get_host=lambda: '0.0.0.0', get_port=lambda: 8080))
+    assert 'without a password' in said
+
+
+def test_a_port_that_is_taken_is_refused_by_name(server: Any) -> None:
+    with pytest.raises(PageError, match=f'port {server.get_port()} .*in use.*--port'):
+        open_page('127.0.0.1', server.get_port())
+
+
+def test_methods_to_choose_from_are_those_of_the_scene() -> None:
+    assert {'combined', 'delete'} < set(METHODS)
