@@ -67,7 +67,9 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 def test_every_file_that_a_document_names_is_there(page: Path) -> None:
-    folders = r'(?:tissue_sim|haptic_bridge|cutting|bags|session|config|launch|msg_defs|docs|test)'
+    folders = (
+        r'(?:tissue_sim|haptic_bridge|cutting|bags|viewer|session|config|launch|msg_defs|docs|test)'
+    )
     for name in re.findall(rf'`({folders}/[\w./-]*\w\.(?:py|md|yaml|xml|msg|srv))`', TEXTS[page]):
         if name != 'config/devices/my_arm.yaml':
             assert (ROOT / name).is_file(), f'{page.name}: {name}'
@@ -100,6 +102,7 @@ def made() -> set[tuple[str, str]]:
                     kind, name = (ast.unparse(argument) for argument in call.args[:2])
                     topic = eval(name, {'ros': ros, **vars(ros)})
                     found.add((topic.lstrip('/'), kind))
+    found |= {(ros.MARKERS, 'MarkerArray'), (ros.HAND, 'PoseStamped')}  # of the viewer
     for owner in (ros.ARM, 'haptic_bridge'):
         found.add((f'{owner}/operating_state', 'OperatingState'))
         found.add((f'{owner}/state_command', 'StringStamped'))

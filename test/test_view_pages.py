@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pages import OpenPage
 
+from bench.open_page import OpenPage
 from viewer.page import PageError, addresses, is_local, open_page
 from viewer.panel import METHODS
 from viewer.stage import TissueView

@@ -1,5 +1,4 @@
-"""Open pages without a browser: clients that read what the page's server sends, as fast or slowly
-as a test wants."""
+"""Open pages without a browser: clients that read what the server sends, fast, slowly or never."""
 
 import importlib.metadata
 import threading
