@@ -3,7 +3,8 @@
 Arguments: NAME, LEDGER (a file that all fake nodes append to), and any of: mute (never ready),
 deaf (ignores SIGINT and SIGTERM), done (says `done` soon), slow (ends 0.3 s after it was asked to),
 dies (exit status 7 before it is ready), refuses (the same with 2, as a node does whose scene is
-bad), falls (killed by a signal soon after it is ready), parent (starts a process of its own).
+bad), asks (the launcher, and repeats its answer), falls (killed by a signal soon after it is
+ready), parent (starts a process of its own).
 """
 
 import os
@@ -39,6 +40,9 @@ def main(name: str, ledger: str, *habits: str) -> None:
     print(f'{name} looks around')
     if 'mute' not in habits:
         print(f'ready: {name}')
+    if 'asks' in habits:
+        print('message: may I?')
+        print(f'message: it was answered {sys.stdin.readline().strip()}')
     if 'done' in habits:
         time.sleep(0.5)
         print(f'done: {name}')

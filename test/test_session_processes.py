@@ -7,6 +7,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -351,3 +352,46 @@ def test_nothing_survives_a_killed_launcher_and_the_recorder_may_close_its_bag(
     wait_for(lambda: not ledger.running())
     assert [name for name, _ in ledger.entries('end')] == ['recorder']
     assert [name for name, _ in ledger.entries('SIGTERM')] == ['recorder']
+
+
+# Nodes that are started again, and one that asks for it
+
+
+def test_nodes_are_replaced_and_removed_while_the_others_run(
+    tmp_path: Path, ledger: Ledger
+) -> None:
+    with Supervisor(commands(ledger), tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:
+        assert supervisor.start()
+        before = supervisor.pids
+        assert supervisor.replace([command(name, ledger) for name in ('cutting', 'tissue_sim')])
+        after = supervisor.pids
+        supervisor.remove(['recorder'])
+        assert 'recorder' not in supervisor.pids
+        outcome = supervisor.end()
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed == {'cutting', 'tissue_sim'}
+    assert not outcome.deaths and not outcome.killed
+    assert not ledger.running()
+
+
+def test_node_that_cannot_take_anothers_place_is_told_and_the_others_run(
+    tmp_path: Path, ledger: Ledger
+) -> None:
+    with Supervisor(commands(ledger), tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:
+        assert supervisor.start()
+        assert not supervisor.replace([command('cutting', ledger, 'refuses')])
+        assert [death.node for death in supervisor.outcome.deaths] == ['cutting']
+        assert supervisor.replace([command('cutting', ledger)])
+        assert supervisor.pids.keys() == set(ORDER)
+    assert not ledger.running()
+
+
+def test_node_that_converses_is_heard_and_answered(tmp_path: Path, ledger: Ledger) -> None:
+    told: list[Event] = []
+    node = replace(command('viewer', ledger, 'asks'), converses=True)
+    with Supervisor([node], tmp_path / 'bag' / 'log', ENVIRONMENT, told.append) as supervisor:
+        assert supervisor.start()
+        supervisor.answer('viewer', 'yes')
+        supervisor.run(0.5)
+        supervisor.answer('nobody', 'yes')
+    assert [e.text for e in told if e.kind == 'message'] == ['may I?', 'it was answered yes']

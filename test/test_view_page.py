@@ -140,7 +140,7 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     scene = load_scene(str(file))
     positions = make_simulation(scene.tissue)[0].positions
     page = browser.page(url)
-    page.wait(lambda: page.says('DISABLED'), 'the state')
+    page.wait(lambda: page.says('Start'), 'the panel')
     eye = Eye(page, positions)
 
     def keep(name: str) -> None:

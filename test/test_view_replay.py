@@ -1,0 +1,109 @@
+"""Claims about the page of a bag: any moment of it, and the session computed again beside it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_session import make_session
+from rich.console import Console
+
+from bags.errors import BagError
+from bags.player import duration
+from bags.reader import Bag, open_bag
+from bags.tissue import tissue_at
+from bench.open_page import OpenPage
+from haptic_bridge.wire import ContactCodec
+from session.recorded_scene import restore_scene
+from session.scene import Scene, load_scene
+from session.view_bag import resimulated
+from viewer.page import addresses
+from viewer.replay_page import ReplayPage
+from viewer.tracks import RecordedTissue, RecordedTool
+
+CUT = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_2' / 'straight_cut'
+NOTES = Console(quiet=True)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Bag:
+    """A session with a cut, of this machine and this version."""
+    folder = tmp_path_factory.mktemp('made')
+    return open_bag(make_session(CUT, folder / 'bag', folder))
+
+
+@pytest.fixture(scope='module')
+def scene(bag: Bag, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(str(restore_scene(bag, tmp_path_factory.mktemp('scene'))))
+
+
+def test_tissue_at_any_moment_is_the_same_forwards_and_back(bag: Bag) -> None:
+    track, end = RecordedTissue(bag), duration(bag)
+    wanted = {share: tissue_at(bag, share * end) for share in (0.3, 0.6, 0.9, 1.0)}
+    assert wanted[1.0].topology > wanted[0.3].topology
+    for share in (0.3, 0.9, 0.6, 0.6, 1.0, 0.3, 0.9):
+        shown = track.go_to(share * end)
+        assert (shown.revision, shown.hash()) == (wanted[share].revision, wanted[share].hash())
+
+
+def test_before_its_first_keyframe_a_bag_shows_that_one(bag: Bag) -> None:
+    track = RecordedTissue(bag)
+    track.go_to(duration(bag))
+    assert track.go_to(-1.0).step == 0
+
+
+def test_session_computed_again_is_the_recorded_one_at_every_moment(bag: Bag, scene: Scene) -> None:
+    computed, recorded = resimulated(bag, scene, NOTES, changed=False), RecordedTissue(bag)
+    cuts = 0
+    # Between two frames, so that neither is on the edge.
+    for time in np.array(computed.times[5:-5:9]) + 0.01:
+        now, then = computed.go_to(time), recorded.go_to(time)
+        np.testing.assert_array_equal(now.triangles, then.triangles)
+        np.testing.assert_array_equal(now.triangle_kind, then.triangle_kind)
+        np.testing.assert_allclose(now.displacement, then.displacement, atol=1e-8)
+        cuts += then.triangle_kind.any()
+    assert cuts > 3
+
+
+def test_changed_tissue_goes_another_way(bag: Bag, scene: Scene, tmp_path: Path) -> None:
+    changes = {'tissue.material.toughness': '2000'}
+    tougher = load_scene(str(restore_scene(bag, tmp_path, changes)))
+    computed = resimulated(bag, tougher, NOTES, changed=True)
+    recorded = RecordedTissue(bag).go_to(duration(bag))
+    assert (computed.stills[-1].triangle_kind == 1).sum() < (recorded.triangle_kind == 1).sum()
+
+
+@pytest.fixture
+def page(bag: Bag, scene: Scene) -> Iterator[ReplayPage]:
+    computed = resimulated(bag, scene, NOTES, changed=False)
+    page = ReplayPage(bag, scene.tool, scene.device, computed, 'computed again', '127.0.0.1', 0)
+    yield page
+    page.server.stop()
+
+
+def test_page_goes_where_the_time_line_is_put(page: ReplayPage, bag: Bag) -> None:
+    end = duration(bag)
+    reader = OpenPage(addresses(page.server))
+    page.show(0.8 * end, 0.0)
+    scene = page.server.scene
+    moved = scene.get_handle_by_name('/tissue/0').vertices
+    late = RecordedTissue(bag).go_to(0.8 * end)
+    used = np.unique(late.triangles[late.triangle_kind == 0])
+    np.testing.assert_allclose(moved, late.positions()[used], atol=1e-7)
+    beside = scene.get_handle_by_name('/computed/0').vertices
+    np.testing.assert_allclose(beside, moved, atol=1e-7)
+    tip = RecordedTool(bag).contact.at(0.8 * end)
+    assert tip is not None
+    np.testing.assert_allclose(
+        scene.get_handle_by_name('/tool').position, tip.values[ContactCodec.fields['device']]
+    )
+    page.show(0.0, 1.0)
+    first = RecordedTissue(bag).go_to(0.0)
+    shown = scene.get_handle_by_name('/tissue/0').vertices
+    np.testing.assert_allclose(shown, first.positions()[np.unique(first.triangles)], atol=1e-7)
+    reader.close()
+
+
+def test_bag_without_tissue_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BagError):
+        RecordedTissue(open_bag(tmp_path))
