@@ -143,11 +143,22 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     page.wait(lambda: page.says('Start'), 'the panel')
     eye = Eye(page, positions)
 
-    def keep(name: str) -> None:
+    def settle() -> np.ndarray:
+        """What is drawn, once it does not change any more: a slow browser draws late."""
         left, top, width, height = eye.box.astype(int)
+        before = np.zeros((height, width, 3))
+        for _ in range(20):
+            time.sleep(1.0)
+            now = page.picture()[top : top + height, left : left + width].astype(float)
+            if np.abs(now - before).mean() < 0.3:
+                break
+            before = now
+        return now.astype(np.uint8)
+
+    def keep(name: str) -> None:
         print(f'{time.monotonic() - began:.1f} s: {name}', flush=True)
         seen.texts[name] = page.evaluate('document.body.innerText')
-        seen.pictures[name] = page.picture()[top : top + height, left : left + width]
+        seen.pictures[name] = settle()
         if folder := os.environ.get('PICTURES'):
             page.save(Path(folder) / f'{name}.png')
 
@@ -157,19 +168,16 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     page.wait(lambda: page.says('Stop recording'), 'the recorder')
     start(page)
     page.wait(lambda: page.says('Drag the handles'), 'the handles')
-    time.sleep(2.0)
+    settle()
     tip = np.array(scene.arm.script.start.position)
     page.drag(eye.pixels(way(tip, np.array([0.0, 0.0, 1.0]), -DOWN)))
-    time.sleep(1.0)
     keep('pressed')
     tip = tip - [0.0, 0.0, DOWN]
     page.drag(eye.pixels(way(tip, np.array([1.0, 0.0, 0.0]), ALONG)))
-    time.sleep(1.0)
     keep('cut')
     page.open(url)
     page.wait(lambda: page.says('ENABLED'), 'the page again')
     page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue again')
-    time.sleep(1.0)
     keep('reloaded')
     page.click('E-STOP')
     page.wait(lambda: page.says('emergency stop'), 'the stop')

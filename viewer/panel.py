@@ -14,6 +14,8 @@ from viewer.history import Floats
 PLOTTED = 15.0
 """[s] that the plots show."""
 _DATA_WIDTH = 320
+_HIGHEST_RATE = 120.0
+"""[%] that the plot shows: who catches up is faster for a moment."""
 METHODS: tuple[str, ...] = get_args(CuttingSettings.model_fields['method'].annotation)
 _COLOURS = {
     State.ENABLED: '#2f9e44',
@@ -156,7 +158,7 @@ class Plots:
         self._force = TimePlot(gui, 'Force on the hand [N]', {'force': '#1c7ed6'}, 0.5)
         self._depth = TimePlot(gui, 'Depth of the blade [mm]', {'depth': '#c2255c'}, 5.0)
         rates = {'force loop': '#1c7ed6', 'tissue': '#e8590c'}
-        self._rates = TimePlot(gui, 'Rates [% of nominal]', rates, 120.0)
+        self._rates = TimePlot(gui, 'Rates [% of nominal]', rates, _HIGHEST_RATE)
 
     def show(self, rows: Floats) -> None:
         """Shows a history.
@@ -169,7 +171,7 @@ class Plots:
         time = rows[:, 0] - rows[-1, 0]
         self._force.show(time, rows[:, 1])
         self._depth.show(time, 1e3 * rows[:, 2])
-        self._rates.show(time, 1e2 * rows[:, 3], 1e2 * rows[:, 4])
+        self._rates.show(time, *np.minimum(1e2 * rows[:, 3:], _HIGHEST_RATE).T)
 
 
 class TimePlot:

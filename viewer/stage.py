@@ -17,6 +17,8 @@ METRES_A_NEWTON = 0.02
 """Length of the arrow by force."""
 FIELD_OF_VIEW = 0.9
 """[rad] of the camera, upright."""
+_LEAST_VIEW = 0.12
+"""[m] that are in view, however small the tissue: the tool has its own size."""
 _LEAST_FORCE = 0.02
 """[N] below which no arrow is drawn."""
 _SPINE, _THICKNESS, _HANDLE = 0.005, 0.0008, 0.07
@@ -149,7 +151,7 @@ def framing(positions: Floats) -> tuple[Floats, Floats]:
         positions: of the tissue [m], shape (n, 3).
     """
     low, high = positions.min(axis=0), positions.max(axis=0)
-    size = float(np.linalg.norm(high - low))
+    size = max(float(np.linalg.norm(high - low)), _LEAST_VIEW)
     aim = (low + high) / 2 + [0.0, 0.0, 0.15 * size]  # the tool is above
     return aim + size * np.array([0.3, -1.25, 0.9]), aim
 

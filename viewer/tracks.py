@@ -62,7 +62,7 @@ class RecordedTissue:
         return self._replica
 
 
-@dataclass
+@dataclass(eq=False)
 class Still:
     """One moment of a computed tissue, with the fields of a replica that are drawn.
 
