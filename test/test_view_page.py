@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import Browser, Page, chromium, needs_chromium
 from live import MEASURED_CP, SERVO_CF, Recording, free_domain, two_presses, write_scene
 
+from bench.browser import CHROMIUM, NO_CARD, Browser, Page, chromium
 from haptic_bridge.chain import INSIDE, TOUCHING
 from haptic_bridge.operating_state import E_STOP
 from haptic_bridge.wire import ContactCodec
@@ -27,7 +27,13 @@ from session.scene import load_scene
 from tissue_sim.assembly import make_simulation
 from viewer.stage import FIELD_OF_VIEW, framing
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.real_time,
+    pytest.mark.skipif(
+        CHROMIUM is None, reason='chromium is not installed: sudo apt install chromium'
+    ),
+]
 
 ROOT = Path(__file__).resolve().parents[1]
 GRIP = 0.028
@@ -36,11 +42,16 @@ DOWN, ALONG = 0.025, 0.026
 """[m] that the blade is dragged: some 5 mm into a block that is 10 mm high, and through it."""
 
 
+FORCE_PLOT = np.s_[96:196, 62:292]
+"""Where the page has the line of the force [pixel]."""
+
+
 @dataclass
 class Seen:
     """What the pages showed, and when things were done."""
 
     pictures: dict[str, np.ndarray] = field(default_factory=dict)
+    plots: dict[str, np.ndarray] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
     requests: list[str] = field(default_factory=list)
     bag: Path = Path()
@@ -134,6 +145,13 @@ def start(page: Page) -> None:
     raise AssertionError(page.evaluate('document.body.innerText'))
 
 
+def height_of_line(plot: np.ndarray) -> int:
+    """Rows [pixel] that the blue line of a plot covers."""
+    r, g, b = plot.astype(int).transpose(2, 0, 1)
+    rows = np.flatnonzero(((b > r + 80) & (b > g + 40)).any(axis=1))
+    return int(np.ptp(rows)) if len(rows) else 0
+
+
 def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     """The session that all tests of this file look at."""
     began = time.monotonic()
@@ -159,10 +177,12 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
         print(f'{time.monotonic() - began:.1f} s: {name}', flush=True)
         seen.texts[name] = page.evaluate('document.body.innerText')
         seen.pictures[name] = settle()
+        seen.plots[name] = page.picture()[FORCE_PLOT]
         if folder := os.environ.get('PICTURES'):
             page.save(Path(folder) / f'{name}.png')
 
     page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue')
+    page.evaluate(NO_CARD)
     keep('before')
     page.click('Record')
     page.wait(lambda: page.says('Stop recording'), 'the recorder')
@@ -178,6 +198,7 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     page.open(url)
     page.wait(lambda: page.says('ENABLED'), 'the page again')
     page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue again')
+    page.evaluate(NO_CARD)
     keep('reloaded')
     page.click('E-STOP')
     page.wait(lambda: page.says('emergency stop'), 'the stop')
@@ -240,6 +261,11 @@ def test_dragged_blade_indents_the_tissue_and_then_cuts_it(recording: Recording)
 
 def test_what_is_cut_open_is_seen_in_its_own_colour(seen: Seen) -> None:
     assert cut_coloured(seen.pictures['cut']).sum() > 100
+
+
+def test_plot_of_the_force_moves_with_it(seen: Seen) -> None:
+    assert height_of_line(seen.plots['before']) <= 4
+    assert max(height_of_line(seen.plots[name]) for name in ('pressed', 'cut')) > 15
 
 
 def test_a_reload_in_mid_session_shows_the_same_again(seen: Seen) -> None:

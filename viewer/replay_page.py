@@ -124,6 +124,11 @@ class ReplayPage:
         if event.client is not None:
             self._playhead.seek(float(self._slider.value))
 
+    def seek(self, position: float) -> None:
+        """Goes to a position [s], with the time line."""
+        self._playhead.seek(position)
+        self._slider.value = round(position, 2)
+
     async def _change_rate(self, _: Any) -> None:
         self._playhead.rate = _RATES[self._rate.value]
 

@@ -17,10 +17,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import numpy as np
-import pytest
 from matplotlib import image
 from websockets.sync.client import connect
 
@@ -30,10 +29,9 @@ SIZE = (1060, 640)
 PATIENCE = 150.0
 """[s] that a shared machine without a graphics card may need for anything."""
 _NAMES = ('chromium', 'chromium-browser', 'google-chrome')
-_CHROMIUM = next(filter(None, map(shutil.which, _NAMES)), None)
-needs_chromium = pytest.mark.skipif(
-    _CHROMIUM is None, reason='chromium is not installed: sudo apt install chromium'
-)
+CHROMIUM = next(filter(None, map(shutil.which, _NAMES)), None)
+NO_CARD = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+"""Script that closes the page's note that there is no graphics card."""
 
 
 class Page:
@@ -140,20 +138,19 @@ class Browser:
 
     Args:
         port: of the DevTools.
+        size: of its pages [pixel].
     """
 
-    def __init__(self, port: int) -> None:
-        self._port = port
+    def __init__(self, port: int, size: tuple[int, int] = SIZE) -> None:
+        self._port, self._size = port, size
         self.pages: list[Page] = []
 
     def page(self, url: str = 'about:blank') -> Page:
         """Opens one more page."""
-        from urllib.request import Request
-
         request = Request(f'http://127.0.0.1:{self._port}/json/new?about:blank', method='PUT')
         with urlopen(request) as answer:
             page = Page(json.load(answer)['webSocketDebuggerUrl'])
-        width, height = SIZE
+        width, height = self._size
         page.call(
             'Emulation.setDeviceMetricsOverride',
             width=width,
@@ -167,13 +164,17 @@ class Browser:
 
 
 @contextmanager
-def chromium() -> Iterator[Browser]:
-    """A browser with a profile of its own, that reaches this machine only; gone in the end."""
-    assert _CHROMIUM is not None
+def chromium(size: tuple[int, int] = SIZE) -> Iterator[Browser]:
+    """A browser with a profile of its own, that reaches this machine only; gone in the end.
+
+    Args:
+        size: of its pages [pixel].
+    """
+    assert CHROMIUM is not None
     with tempfile.TemporaryDirectory(prefix='chromium-', ignore_cleanup_errors=True) as profile:
         # Bound to this process, whatever ends it.
         command = [sys.executable, '-I', '-S', child.__file__, str(os.getpid()), '9']
-        command += [_CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
+        command += [CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
         command += [f'--user-data-dir={profile}', '--no-first-run', '--disable-extensions']
         command += ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--mute-audio']
         command += ['--disable-background-networking', '--disable-dev-shm-usage']
@@ -192,7 +193,7 @@ def chromium() -> Iterator[Browser]:
                 assert process.poll() is None, Path(profile, 'said').read_text()
                 assert time.monotonic() < deadline, 'chromium does not start'
                 time.sleep(0.05)
-            browser = Browser(int(file.read_text().splitlines()[0]))
+            browser = Browser(int(file.read_text().splitlines()[0]), size)
             yield browser
             for page in browser.pages:
                 page.close()
