@@ -1,6 +1,6 @@
 """Claims about the page of a live session, made with a browser as a person would use it.
 
-One session: look, start, record, drag the blade down and along, reload, stop.
+One session: look, record, start, press with the blade, stop at once, start again, cut, reload.
 """
 
 import json
@@ -38,8 +38,9 @@ pytestmark = [
 ROOT = Path(__file__).resolve().parents[1]
 GRIP = 0.028
 """[m] from the tip to where the arrows of the handles are gripped."""
-DOWN, ALONG = 0.025, 0.026
-"""[m] that the blade is dragged: some 5 mm into a block that is 10 mm high, and through it."""
+PRESS, DOWN, ALONG = 0.0180, 0.025, 0.026
+"""[m] that the blade is dragged: to press on a block that is 10 mm high, 9 mm into it, along it."""
+UP = np.array([0.0, 0.0, 1.0])
 
 
 FORCE_PLOT = np.s_[96:196, 62:292]
@@ -190,19 +191,23 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     page.wait(lambda: page.says('Drag the handles'), 'the handles')
     settle()
     tip = np.array(scene.arm.script.start.position)
-    page.drag(eye.pixels(way(tip, np.array([0.0, 0.0, 1.0]), -DOWN)))
+    page.drag(eye.pixels(way(tip, UP, -PRESS)))
     keep('pressed')
-    tip = tip - [0.0, 0.0, DOWN]
-    page.drag(eye.pixels(way(tip, np.array([1.0, 0.0, 0.0]), ALONG)))
-    keep('cut')
-    page.open(url)
-    page.wait(lambda: page.says('ENABLED'), 'the page again')
-    page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue again')
-    page.evaluate(NO_CARD)
-    keep('reloaded')
     page.click('E-STOP')
     page.wait(lambda: page.says('emergency stop'), 'the stop')
     keep('stopped')
+    start(page)
+    page.wait(lambda: page.says('Drag the handles'), 'the handles')
+    settle()
+    page.drag(eye.pixels(way(tip - PRESS * UP, UP, PRESS - DOWN)))
+    settle()
+    page.drag(eye.pixels(way(tip - DOWN * UP, np.array([1.0, 0.0, 0.0]), ALONG)))
+    keep('cut')
+    page.open(url)
+    page.wait(lambda: page.says('Start'), 'the page again')
+    page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue again')
+    page.evaluate(NO_CARD)
+    keep('reloaded')
     page.click('Stop recording')
     page.wait(lambda: page.says('Record') and not page.says('Stop recording'), 'the end of the bag')
     seen.requests = page.requests
@@ -212,7 +217,7 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
     seen = Seen()
     folder = tmp_path_factory.mktemp('view')
-    scene = write_scene(folder, two_presses(), 20.0, cut_threshold=0.4)
+    scene = write_scene(folder, two_presses(), 20.0, cut_threshold=0.6)
     view = View(folder, scene)
     known = set((ROOT / 'bags' / 'sessions').glob('*'))
     try:
@@ -256,7 +261,7 @@ def test_dragged_blade_indents_the_tissue_and_then_cuts_it(recording: Recording)
     assert len(touched) and len(inside)
     assert touched[0] < inside[0]
     forces = recording.force(SERVO_CF)[1]
-    assert forces.max() > 0.3
+    assert forces.max() > 0.15
 
 
 def test_what_is_cut_open_is_seen_in_its_own_colour(seen: Seen) -> None:
@@ -265,13 +270,13 @@ def test_what_is_cut_open_is_seen_in_its_own_colour(seen: Seen) -> None:
 
 def test_plot_of_the_force_moves_with_it(seen: Seen) -> None:
     assert height_of_line(seen.plots['before']) <= 4
-    assert max(height_of_line(seen.plots[name]) for name in ('pressed', 'cut')) > 15
+    assert max(height_of_line(seen.plots[name]) for name in ('pressed', 'stopped')) > 15
 
 
 def test_a_reload_in_mid_session_shows_the_same_again(seen: Seen) -> None:
     cut, again = seen.pictures['cut'], seen.pictures['reloaded']
     assert cut_coloured(again).sum() > 0.5 * cut_coloured(cut).sum()
-    assert 'ENABLED' in seen.texts['reloaded']
+    assert 'Stop recording' in seen.texts['reloaded']
 
 
 def test_e_stop_is_zero_force_and_fault_within_50_ms(recording: Recording) -> None:
@@ -282,7 +287,9 @@ def test_e_stop_is_zero_force_and_fault_within_50_ms(recording: Recording) -> No
     clicked = recording.at(next(stamp for word, stamp in commands if word == E_STOP))
     times, norms = recording.force(SERVO_CF)
     assert norms[(times > clicked - 0.1) & (times <= clicked)].max() > 0
-    assert not norms[times > clicked + 0.05].any()
+    later = [recording.at(stamp) for word, stamp in commands if word == 'enable']
+    again = min(time for time in later if time > clicked)
+    assert not norms[(times > clicked + 0.05) & (times < again)].any()
     states: list[tuple[str, float]] = []
     for message in recording.messages('/haptic_bridge/operating_state'):
         states.append((recording.bag.read(message).state, recording.at(message.publish_time)))
