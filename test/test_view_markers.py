@@ -1,10 +1,14 @@
 """Claims about the markers for RViz and Foxglove, decoded by the classes of their messages."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import Point
 from meshes import box
 from rclpy.serialization import deserialize_message
+from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 from strokes import draw, mesh_of, method_named, straight
 from visualization_msgs.msg import Marker, MarkerArray
@@ -13,11 +17,13 @@ from haptic_bridge.chain import TOUCHING
 from haptic_bridge.settings import DeviceSettings
 from tissue_sim.messages import mesh_message
 from tissue_sim.replica import MeshReplica
+from tissue_sim.ros import ARM, CONTACT, DIAGNOSTICS, FRAME, MARKERS
 from viewer.frames import device_frame
 from viewer.markers import Markers, shades, von_mises
 from viewer.moment import Moment
 from viewer.stage import METRES_A_NEWTON
 
+CONFIG = Path(__file__).resolve().parents[1] / 'config'
 LARGEST = 0.004
 STAMP = 12_000_000_034
 E, NU = 5400.0, 0.45
@@ -133,3 +139,21 @@ def test_frame_of_the_device_maps_its_points_to_the_tissue():
     point = np.array([0.01, 0.02, 0.03])
     mapped = np.add(Rotation.from_quat([q.x, q.y, q.z, q.w]).apply(point), (to.x, to.y, to.z))
     np.testing.assert_allclose(mapped, device.tissue_from_device.to_tissue(point), atol=1e-12)
+
+
+def test_layouts_that_are_shipped_name_what_is_published():
+    rviz = YAML(typ='safe').load(CONFIG / 'rviz' / 'trainer.rviz')['Visualization Manager']
+    shown = {display['Name']: display for display in rviz['Displays']}
+    markers = shown['Tissue and tool']
+    assert rviz['Global Options']['Fixed Frame'] == FRAME
+    assert markers['Topic']['Value'] == f'/{MARKERS}'
+    assert set(markers['Namespaces']) == {'tissue', 'cut', 'tool', 'proxy', 'force'}
+    layout = json.loads((CONFIG / 'foxglove' / 'trainer.json').read_text())['configById']
+    scene = layout['3D!tissue']
+    assert scene['followTf'] == FRAME
+    topics = set(scene['topics'])
+    for panel in layout.values():
+        topics |= {path['value'].partition('.')[0] for path in panel.get('paths', [])}
+    published = {f'/{MARKERS}', f'/{CONTACT}', f'/{ARM}/servo_cf', f'/{ARM}/measured_cp'}
+    assert topics == published
+    assert layout['DiagnosticSummary!nodes']['topicToRender'] == DIAGNOSTICS

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from haptic_bridge.chain import NONE
 from haptic_bridge.convention import DeviceConvention
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.wire import ContactCodec, Sample, WrenchStampedCodec
@@ -73,8 +72,3 @@ class Translator:
             contact=int(get('state')[0]),
             force=force,
         )
-
-
-def touches(moment: Moment) -> bool:
-    """Whether the tool is at or in the tissue."""
-    return moment.contact != NONE

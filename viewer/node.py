@@ -102,8 +102,9 @@ class ViewerNode(Node):
         self._frames = Counter()
         self._samples = ros.polled(self, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
         self._connect()
-        self._state, self._nodes = '', dict[str, tuple[float, NodeState]]()
-        self._arm_state = ''
+        self._state: State | None = None
+        self._arm_state: State | None = None
+        self._nodes: dict[str, tuple[float, NodeState]] = {}
         self._answers: list[SessionState] = []
         actions = Actions(
             start=self._start,
@@ -193,9 +194,9 @@ class ViewerNode(Node):
             self._wrench.counter.rate(now) / self._nominal[0],
             self._frames.rate(now) / self._nominal[1],
         )
-        can_guide = self._state == State.ENABLED and self._goal.get_subscription_count() > 0
+        can_guide = self._state is State.ENABLED and self._goal.get_subscription_count() > 0
         self._page.show(now, self._follower.replica, moment, rates, can_guide=can_guide)
-        self._page.show_state(self._state, self._said(now))
+        self._page.show_state(str(self._state or ''), self._said(now, can_guide=can_guide))
         self._page.show_nodes(now, self._nodes_now(now))
         self._publish_markers(now, moment)
 
@@ -212,8 +213,8 @@ class ViewerNode(Node):
     # What operators do
 
     def _start(self) -> None:
-        resume = 'resume' if self._state == State.PAUSED else 'enable'
-        self._send(self._to_arm, 'resume' if self._arm_state == State.PAUSED else 'enable')
+        resume = 'resume' if self._state is State.PAUSED else 'enable'
+        self._send(self._to_arm, 'resume' if self._arm_state is State.PAUSED else 'enable')
         self._send(self._to_bridge, resume)
 
     def _pause(self) -> None:
@@ -282,10 +283,10 @@ class ViewerNode(Node):
     # What the nodes say
 
     def _bridge_state(self, message: Any) -> None:
-        self._state = message.state
+        self._state = known_state(message.state)
 
     def _arm_says(self, message: Any) -> None:
-        self._arm_state = message.state
+        self._arm_state = known_state(message.state)
 
     def _take_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -305,27 +306,30 @@ class ViewerNode(Node):
             states.append(state)
         return states
 
-    def _said(self, now: float) -> str:
+    def _said(self, now: float, *, can_guide: bool) -> str:
         """What is to be said about the operating state."""
         heard, bridge = self._nodes.get(BRIDGE, (0.0, None))
         if bridge is None or now - heard > 3.0:
             return 'The haptic bridge is silent.'
-        return (
-            {
-                State.ENABLED: 'Force is on. Drag the handles at the blade to move it.',
-                State.PAUSED: 'No force. Start goes on.',
-                State.DISABLED: 'No force. Start lets it in.',
-                State.FAULT: f'{bridge.message}. No force until Start.',
-            }.get(State(self._state), '')
-            if self._state
-            else ''
-        )
+        handles = 'Drag the handles at the blade to move it.' if can_guide else ''
+        said = {
+            State.ENABLED: f'Force is on. {handles}',
+            State.PAUSED: 'No force. Start goes on.',
+            State.DISABLED: 'No force. Start lets it in.',
+            State.FAULT: f'{bridge.message}. No force until Start.',
+        }
+        return said[self._state] if self._state is not None else ''
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         pages = len(self._server.get_clients())
         values: dict[str, object] = dict(self._loop.report())
         values |= {'pages': pages, 'revision_gaps': self._follower.gaps}
         return DiagnosticStatus.OK, f'{pages} page{"s" * (pages != 1)}', values
+
+
+def known_state(name: str) -> State | None:
+    """One of CRTK's states; None where a foreign device says something else."""
+    return next((state for state in State if state == name), None)
 
 
 def known_scenes() -> list[str]:
