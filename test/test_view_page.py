@@ -137,7 +137,8 @@ def cut_coloured(picture: np.ndarray) -> np.ndarray:
 def start(page: Page) -> None:
     """Lets the force in; again where a machine that stood still has made a fault."""
     for _ in range(10):
-        page.click('Start')
+        if not page.says('ENABLED'):
+            page.click('Start')
         deadline = time.monotonic() + 3.0
         while time.monotonic() < deadline:
             if page.says('ENABLED'):
@@ -167,7 +168,7 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
         left, top, width, height = eye.box.astype(int)
         before = np.zeros((height, width, 3))
         for _ in range(20):
-            time.sleep(1.0)
+            time.sleep(0.5)
             now = page.picture()[top : top + height, left : left + width].astype(float)
             if np.abs(now - before).mean() < 0.3:
                 break
@@ -193,6 +194,8 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     tip = np.array(scene.arm.script.start.position)
     page.drag(eye.pixels(way(tip, UP, -PRESS)))
     keep('pressed')
+    start(page)
+    settle()
     page.click('E-STOP')
     page.wait(lambda: page.says('emergency stop'), 'the stop')
     keep('stopped')
@@ -200,6 +203,7 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
     page.wait(lambda: page.says('Drag the handles'), 'the handles')
     settle()
     page.drag(eye.pixels(way(tip - PRESS * UP, UP, PRESS - DOWN)))
+    start(page)
     settle()
     page.drag(eye.pixels(way(tip - DOWN * UP, np.array([1.0, 0.0, 0.0]), ALONG)))
     keep('cut')

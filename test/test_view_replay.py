@@ -19,7 +19,7 @@ from session.scene import Scene, load_scene
 from session.view_bag import resimulated
 from viewer.page import addresses
 from viewer.replay_page import ReplayPage
-from viewer.tracks import RecordedTissue, RecordedTool
+from viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
 
 CUT = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 NOTES = Console(quiet=True)
@@ -37,6 +37,11 @@ def scene(bag: Bag, tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(str(restore_scene(bag, tmp_path_factory.mktemp('scene'))))
 
 
+@pytest.fixture(scope='module')
+def again(bag: Bag, scene: Scene) -> ComputedTissue:
+    return resimulated(bag, scene, NOTES, changed=False)
+
+
 def test_tissue_at_any_moment_is_the_same_forwards_and_back(bag: Bag) -> None:
     track, end = RecordedTissue(bag), duration(bag)
     wanted = {share: tissue_at(bag, share * end) for share in (0.3, 0.6, 0.9, 1.0)}
@@ -52,12 +57,14 @@ def test_before_its_first_keyframe_a_bag_shows_that_one(bag: Bag) -> None:
     assert track.go_to(-1.0).step == 0
 
 
-def test_session_computed_again_is_the_recorded_one_at_every_moment(bag: Bag, scene: Scene) -> None:
-    computed, recorded = resimulated(bag, scene, NOTES, changed=False), RecordedTissue(bag)
+def test_session_computed_again_is_the_recorded_one_at_every_moment(
+    bag: Bag, again: ComputedTissue
+) -> None:
+    recorded = RecordedTissue(bag)
     cuts = 0
     # Between two frames, so that neither is on the edge.
-    for time in np.array(computed.times[5:-5:9]) + 0.01:
-        now, then = computed.go_to(time), recorded.go_to(time)
+    for time in np.array(again.times[5:-5:9]) + 0.01:
+        now, then = again.go_to(time), recorded.go_to(time)
         np.testing.assert_array_equal(now.triangles, then.triangles)
         np.testing.assert_array_equal(now.triangle_kind, then.triangle_kind)
         np.testing.assert_allclose(now.displacement, then.displacement, atol=1e-8)
@@ -74,9 +81,8 @@ def test_changed_tissue_goes_another_way(bag: Bag, scene: Scene, tmp_path: Path)
 
 
 @pytest.fixture
-def page(bag: Bag, scene: Scene) -> Iterator[ReplayPage]:
-    computed = resimulated(bag, scene, NOTES, changed=False)
-    page = ReplayPage(bag, scene.tool, scene.device, computed, 'computed again', '127.0.0.1', 0)
+def page(bag: Bag, scene: Scene, again: ComputedTissue) -> Iterator[ReplayPage]:
+    page = ReplayPage(bag, scene.tool, scene.device, again, 'computed again', '127.0.0.1', 0)
     yield page
     page.server.stop()
 
