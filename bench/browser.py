@@ -25,7 +25,6 @@ from websockets.sync.client import connect
 
 from session import child
 
-SIZE = (1060, 640)
 PATIENCE = 150.0
 """[s] that a shared machine without a graphics card may need for anything."""
 _NAMES = ('chromium', 'chromium-browser', 'google-chrome')
@@ -39,9 +38,11 @@ class Page:
 
     Args:
         address: of its DevTools socket.
+        coarseness: pixels of the page for one that is drawn, along each side.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, coarseness: int = 1) -> None:
+        self._coarseness = coarseness
         self._socket = connect(address, max_size=None)
         self._numbers = itertools.count(1)
         self.requests: list[str] = []
@@ -72,7 +73,8 @@ class Page:
     def picture(self) -> np.ndarray:
         """What is seen, shape (height, width, 3), 0 to 255."""
         data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
-        return np.rint(255 * image.imread(io.BytesIO(data))[..., :3]).astype(np.uint8)
+        drawn = np.rint(255 * image.imread(io.BytesIO(data))[..., :3]).astype(np.uint8)
+        return drawn.repeat(self._coarseness, axis=0).repeat(self._coarseness, axis=1)
 
     def save(self, file: Path) -> None:
         """Writes what is seen as PNG."""
@@ -139,23 +141,24 @@ class Browser:
     Args:
         port: of the DevTools.
         size: of its pages [pixel].
+        coarseness: pixels of the page for one that is drawn, along each side.
     """
 
-    def __init__(self, port: int, size: tuple[int, int] = SIZE) -> None:
-        self._port, self._size = port, size
+    def __init__(self, port: int, size: tuple[int, int], coarseness: int) -> None:
+        self._port, self._size, self._coarseness = port, size, coarseness
         self.pages: list[Page] = []
 
     def page(self, url: str = 'about:blank') -> Page:
         """Opens one more page."""
         request = Request(f'http://127.0.0.1:{self._port}/json/new?about:blank', method='PUT')
         with urlopen(request) as answer:
-            page = Page(json.load(answer)['webSocketDebuggerUrl'])
+            page = Page(json.load(answer)['webSocketDebuggerUrl'], self._coarseness)
         width, height = self._size
         page.call(
             'Emulation.setDeviceMetricsOverride',
             width=width,
             height=height,
-            deviceScaleFactor=1,
+            deviceScaleFactor=1 / self._coarseness,
             mobile=False,
         )
         page.open(url)
@@ -164,11 +167,12 @@ class Browser:
 
 
 @contextmanager
-def chromium(size: tuple[int, int] = SIZE) -> Iterator[Browser]:
+def chromium(size: tuple[int, int], coarseness: int = 1) -> Iterator[Browser]:
     """A browser with a profile of its own, that reaches this machine only; gone in the end.
 
     Args:
         size: of its pages [pixel].
+        coarseness: pixels of a page for one that is drawn: software draws slowly.
     """
     assert CHROMIUM is not None
     with tempfile.TemporaryDirectory(prefix='chromium-', ignore_cleanup_errors=True) as profile:
@@ -193,7 +197,7 @@ def chromium(size: tuple[int, int] = SIZE) -> Iterator[Browser]:
                 assert process.poll() is None, Path(profile, 'said').read_text()
                 assert time.monotonic() < deadline, 'chromium does not start'
                 time.sleep(0.05)
-            browser = Browser(int(file.read_text().splitlines()[0]), size)
+            browser = Browser(int(file.read_text().splitlines()[0]), size, coarseness)
             yield browser
             for page in browser.pages:
                 page.close()

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live import MEASURED_CP, SERVO_CF, Recording, free_domain, two_presses, write_scene
+from live import MEASURED_CP, SERVO_CF, Recording, two_presses, write_scene
 
 from bench.browser import CHROMIUM, NO_CARD, Browser, Page, chromium
 from haptic_bridge.chain import INSIDE, TOUCHING
@@ -67,7 +67,7 @@ class View:
         command = [sys.executable, '-m', 'session.cli', 'view', '--port', '0']
         with self._said.open('wb') as file:
             self.process = subprocess.Popen(
-                [*command, '--scene', str(scene), '--domain', str(free_domain())],
+                [*command, '--scene', str(scene), '--domain', 'free'],
                 cwd=ROOT,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
@@ -226,7 +226,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
     known = set((ROOT / 'bags' / 'sessions').glob('*'))
     try:
         url = view.url()
-        with chromium() as browser:
+        with chromium((1060, 640), coarseness=2) as browser:
             use(browser, url, scene, seen)
         (seen.bag,) = set((ROOT / 'bags' / 'sessions').glob('*')) - known
         seen.status = view.end()
