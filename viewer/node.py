@@ -1,6 +1,7 @@
 """The node `viewer`: a page in the browser on a session that runs."""
 
 import json
+import math
 import os
 import sys
 import threading
@@ -40,6 +41,8 @@ except ModuleNotFoundError:  # it is not among the wheels
 
 MARKER_PERIOD = 0.1
 """[s] between two sets of markers."""
+HEARING = 0.1
+"""[s] in which the haptic bridge has heard of the arm's state, too."""
 RATE = 30.0
 """Updates of the page [Hz], at most."""
 _NICENESS = 10
@@ -104,6 +107,8 @@ class ViewerNode(Node):
         self._connect()
         self._state: State | None = None
         self._arm_state: State | None = None
+        self._starting = False
+        self._enable_at = math.inf
         self._nodes: dict[str, tuple[float, NodeState]] = {}
         self._answers: list[SessionState] = []
         actions = Actions(
@@ -183,6 +188,8 @@ class ViewerNode(Node):
             stream.poll(now)
         if (taken := ros.take_numbered(self._samples)) is not None:
             self._frames.see(now, taken[1])
+        if now >= self._enable_at:
+            self._enable_bridge()
         while self._answers:
             self._take_answer(self._answers.pop(0))
         moment = None
@@ -213,15 +220,23 @@ class ViewerNode(Node):
     # What operators do
 
     def _start(self) -> None:
-        resume = 'resume' if self._state is State.PAUSED else 'enable'
-        self._send(self._to_arm, 'resume' if self._arm_state is State.PAUSED else 'enable')
-        self._send(self._to_bridge, resume)
+        # The bridge refuses while its device cannot take a force: the arm comes first.
+        if self._arm_state in (None, State.ENABLED):
+            self._enable_bridge()
+        else:
+            self._starting = True
+            self._send(self._to_arm, 'resume' if self._arm_state is State.PAUSED else 'enable')
+
+    def _enable_bridge(self) -> None:
+        self._starting, self._enable_at = False, math.inf
+        self._send(self._to_bridge, 'resume' if self._state is State.PAUSED else 'enable')
 
     def _pause(self) -> None:
         self._send(self._to_bridge, 'pause')
         self._send(self._to_arm, 'pause')
 
     def _stop_at_once(self) -> None:
+        self._starting, self._enable_at = False, math.inf
         self._send(self._to_bridge, E_STOP)
         self._send(self._to_arm, 'disable')
 
@@ -287,6 +302,8 @@ class ViewerNode(Node):
 
     def _arm_says(self, message: Any) -> None:
         self._arm_state = known_state(message.state)
+        if self._starting and self._arm_state is State.ENABLED:
+            self._enable_at = time.monotonic() + HEARING
 
     def _take_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
