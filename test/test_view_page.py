@@ -137,11 +137,11 @@ def cut_coloured(picture: np.ndarray) -> np.ndarray:
 def start(page: Page) -> None:
     """Lets the force in; again where a machine that stood still has made a fault."""
     for _ in range(10):
-        if not page.says('ENABLED'):
+        if not page.says('Force is on'):
             page.click('Start')
         deadline = time.monotonic() + 3.0
         while time.monotonic() < deadline:
-            if page.says('ENABLED'):
+            if page.says('Force is on'):
                 return
             time.sleep(0.1)
     raise AssertionError(page.evaluate('document.body.innerText'))
