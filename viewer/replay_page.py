@@ -80,7 +80,7 @@ class ReplayPage:
     def _add_controls(self, name: str) -> None:
         gui = self.server.gui
         self._button = gui.add_button('Play')
-        self._slider = gui.add_slider('Time [s]', 0.0, self._end, 0.01, 0.0)
+        self._slider = gui.add_slider('Time [s]', 0.0, round(self._end, 2), 0.01, 0.0)
         self._rate = gui.add_dropdown('Speed', tuple(_RATES), initial_value='1 x')
         self._button.on_click(self._toggle)
         self._slider.on_update(self._seek)
@@ -127,7 +127,7 @@ class ReplayPage:
     def seek(self, position: float) -> None:
         """Goes to a position [s], with the time line."""
         self._playhead.seek(position)
-        self._slider.value = round(position, 2)
+        self._slider.value = round(self._playhead.position, 2)
 
     async def _change_rate(self, _: Any) -> None:
         self._playhead.rate = _RATES[self._rate.value]
