@@ -116,7 +116,6 @@ class Stage:
         ):
             vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
             scene.add_mesh_simple(f'/tool/{name}', vertices, faces, color=colour, flat_shading=True)
-        scene.add_icosphere('/tool/sphere', radius=tool.radius, color=BLADE, opacity=0.25)
         self._proxy.scale = tool.radius
 
     def look_at(self, tissue: MeshReplica, *, beside: bool = False) -> None:
