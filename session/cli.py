@@ -410,6 +410,22 @@ def bench_timing(
     raise typer.Exit(int(run_bench(scene, seconds, parse_domain(domain), as_json=as_json)))
 
 
+@app.command(epilog=EXIT_STATUSES)
+def doctor(
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the findings as JSON on standard output.')
+    ] = False,
+) -> None:
+    """Examine this machine: Python, compiler, DDS, real time, ports, time sync; what to do."""
+    from session.doctor import run_doctor, running_python
+    from session.graph import node_environment
+
+    environment = node_environment(int(os.environ.get('ROS_DOMAIN_ID') or 0))
+    raise typer.Exit(
+        int(run_doctor([running_python], sys.executable, environment, as_json=as_json))
+    )
+
+
 @app.command(
     epilog='Exit status: that of the program.',
     context_settings={'allow_extra_args': True, 'ignore_unknown_options': True},

@@ -11,7 +11,8 @@ from session.errors import SessionError
 
 LARGEST_DOMAIN = 101
 """Above it, DDS's ports reach into those that Linux gives to anybody."""
-_FIRST_PORT, _PORTS_PER_DOMAIN, _FIRST_PARTICIPANT = 7400, 250, 10
+FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
+_FIRST_PARTICIPANT = 10
 _CREDENTIALS = struct.Struct('3i')
 
 
@@ -94,7 +95,7 @@ def _first_free() -> tuple[int, socket.socket]:
 def _has_participants(domain: int) -> bool:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.bind(('', _FIRST_PORT + _PORTS_PER_DOMAIN * domain + _FIRST_PARTICIPANT))
+            probe.bind(('', FIRST_PORT + PORTS_PER_DOMAIN * domain + _FIRST_PARTICIPANT))
         except OSError:
             return True
     return False

@@ -3,6 +3,7 @@
 import ast
 import fcntl
 import importlib.util
+import json
 import os
 import shutil
 import signal
@@ -436,3 +437,21 @@ def test_clean_leaves_nothing_but_the_lock(tree: Path) -> None:
     (tree / '.trainer' / 'wheels' / 'env').mkdir(parents=True)
     assert start(tree, 'clean').returncode == 0
     assert [path.name for path in (tree / '.trainer').iterdir()] == ['lock']
+
+
+def test_doctor_examines_a_machine_on_which_nothing_is_set_up(tree: Path) -> None:
+    done = start(tree, 'doctor', '--json', PYTHONPATH='')
+    told = json.loads(done.stdout)
+    found = {check['check']: check for check in told['checks']}
+    assert done.returncode == (0 if told['ok'] else 1)
+    assert {'python', 'compiler', 'set-up', 'kernel cache', 'dds', 'real time'} <= found.keys()
+    assert found['set-up']['level'] == found['dds']['level'] == 'warning'
+    assert not (tree / '.trainer').exists()
+
+
+def test_doctor_names_a_missing_tool_as_setting_up_does(tree: Path, tmp_path: Path) -> None:
+    (tmp_path / 'empty').mkdir()
+    done = start(tree, 'doctor', PATH=str(tmp_path / 'empty'))
+    assert done.returncode == 1
+    (wrong,) = [line for line in done.stdout.splitlines() if 'compiler' in line]
+    assert wrong.startswith('ERROR') and 'apt install' in wrong
