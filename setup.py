@@ -5,7 +5,13 @@ from pathlib import Path
 from setuptools import setup
 
 ROOT = Path(__file__).parent
-REQUIREMENTS = (ROOT / 'requirements.txt').read_text().splitlines()
+
+
+def at_least(name: str) -> list[str]:
+    """Lower bounds: the launcher pins exactly, a library must not."""
+    lines = (ROOT / name).read_text().splitlines()
+    return [line.replace('==', '>=') for line in lines if line and not line.startswith('#')]
+
 
 setup(
     name='cutting_trainer',
@@ -14,9 +20,7 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.11,<3.14',
     packages=['tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'viewer', 'session'],
-    # Lower bounds: the launcher pins exactly, a library must not.
-    install_requires=[
-        line.replace('==', '>=') for line in REQUIREMENTS if line and not line.startswith('#')
-    ],
+    install_requires=at_least('requirements.txt'),
+    extras_require={'mesh': at_least('requirements-mesh.txt')},
     entry_points={'console_scripts': ['cutting-trainer = session.cli:main']},
 )

@@ -3,7 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -408,6 +408,39 @@ def bench_timing(
     from session.domain import parse_domain
 
     raise typer.Exit(int(run_bench(scene, seconds, parse_domain(domain), as_json=as_json)))
+
+
+@app.command('import-mesh', epilog=EXIT_STATUSES)
+def import_mesh(
+    surface: Annotated[
+        Path, typer.Argument(help='Closed surface: .stl, .ply, .obj or what else trimesh reads.')
+    ],
+    output: Annotated[
+        Path,
+        typer.Option('--output', '-o', help='NAME: writes NAME.msh and the scene NAME.yaml.'),
+    ],
+    unit: Annotated[
+        Literal['m', 'cm', 'mm'], typer.Option(help='Unit of length in the file.')
+    ] = 'mm',
+    edge: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-4, max=1.0, help='Length of edge to aim at [m] (default: 4000 tetrahedra).'
+        ),
+    ] = None,
+    rests_on: Annotated[
+        str,
+        typer.Option(help='Side that is turned down and held: -x, +x, -y, +y, -z or +z.'),
+    ] = '-z',
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the report as JSON on standard output.')
+    ] = False,
+) -> None:
+    """Fill the surface of an organ with tetrahedra; write a mesh, a quality report, a scene."""
+    from session.import_mesh import ImportOptions
+    from session.import_mesh import import_mesh as make
+
+    raise typer.Exit(int(make(ImportOptions(surface, output, unit, edge, rests_on, as_json))))
 
 
 @app.command(epilog=EXIT_STATUSES)

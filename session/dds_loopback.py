@@ -26,7 +26,12 @@ def echo(name: str) -> None:
 
     node, publisher, subscription = _ends(f'{name}_pong', f'{name}_ping')
     over = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+
+    def wait_for_end() -> None:
+        sys.stdin.read()
+        over.set()
+
+    threading.Thread(target=wait_for_end, daemon=True).start()
     while not over.wait(2e-4):
         message = _take(subscription)
         if message is not None:

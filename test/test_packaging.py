@@ -66,7 +66,12 @@ def pins(name: str) -> dict[str, str]:
 
 
 COMPILED = shutil.ignore_patterns('__pycache__', 'sessions')
-LISTS = ('requirements.txt', 'requirements-ros.txt', 'requirements-test.txt')
+LISTS = (
+    'requirements.txt',
+    'requirements-ros.txt',
+    'requirements-mesh.txt',
+    'requirements-test.txt',
+)
 
 
 @pytest.mark.parametrize('name', LISTS)
@@ -96,7 +101,9 @@ def imported_by(folder: str) -> set[str]:
 
 @pytest.mark.parametrize('package', PACKAGES)
 def test_every_library_that_a_package_imports_is_pinned_for_run_time(package: str) -> None:
-    assert imported_by(package) <= pins('requirements.txt').keys()
+    # the mesher is an extra: it has no wheels for every machine
+    extra = {'pytetwild'} if package == 'session' else set()
+    assert imported_by(package) <= pins('requirements.txt').keys() | extra
 
 
 def test_every_library_that_the_tests_import_is_pinned() -> None:

@@ -1,0 +1,292 @@
+"""An organ of one's own: what a surface may be, what is mended, what comes out of it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from cutting.methods import make_method
+from haptic_bridge.force_path import ForcePath
+from haptic_bridge.hand import compile_script
+from session import mesher
+from session.errors import SessionError
+from session.import_mesh import SIDES, ImportOptions, import_mesh
+from session.imported_scene import height
+from session.in_process import InProcess, Tissue
+from session.scene import load_scene
+from session.status import Status
+from session.surface_import import read_surface
+from tissue_sim.assembly import make_simulation
+
+BODY = trimesh.creation.icosphere(subdivisions=3, radius=30.0)
+BODY.apply_scale([1.3, 1.0, 0.6])
+"""[mm], rounded like an organ, 78 x 60 x 36."""
+
+
+def without(*triangles: int) -> trimesh.Trimesh:
+    kept = np.ones(len(BODY.faces), bool)
+    kept[list(triangles)] = False
+    mesh = BODY.copy()
+    mesh.update_faces(kept)
+    return mesh
+
+
+def with_faces(faces: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(BODY.vertices, faces, process=False)
+
+
+def turned(count: int) -> trimesh.Trimesh:
+    faces = BODY.faces.copy()
+    faces[:count] = faces[:count, ::-1]
+    return with_faces(faces)
+
+
+def saved(folder: Path, mesh: trimesh.Trimesh, name: str = 'organ.stl') -> Path:
+    mesh.export(folder / name)
+    return folder / name
+
+
+@pytest.mark.parametrize('name', ['organ.stl', 'organ.ply', 'organ.obj'])
+def test_closed_surface_is_taken_as_it_is(tmp_path: Path, name: str) -> None:
+    surface = read_surface(saved(tmp_path, BODY, name), 'mm')
+    assert surface.mended == ()
+    assert surface.parts == 1
+    assert surface.volume == pytest.approx(BODY.volume * 1e-9, rel=1e-5)
+    assert surface.size == pytest.approx([0.078, 0.060, 0.036], rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ('mesh', 'named'),
+    [
+        (without(17), 'holes'),
+        (turned(len(BODY.faces)), 'the whole surface'),
+        (turned(40), '40 triangles that faced inward'),
+        (with_faces(np.vstack((BODY.faces, BODY.faces[:5]))), '5 triangles, flat or double'),
+    ],
+    ids=['missing triangle', 'inside out', 'some inside out', 'double'],
+)
+def test_defect_with_one_answer_is_mended_and_named(
+    tmp_path: Path, mesh: trimesh.Trimesh, named: str
+) -> None:
+    surface = read_surface(saved(tmp_path, mesh, 'organ.ply'), 'mm')
+    (sentence,) = surface.mended
+    assert named in sentence
+    again = trimesh.Trimesh(surface.vertices, surface.triangles, process=False)
+    assert again.is_watertight and again.is_winding_consistent
+    assert again.volume == pytest.approx(BODY.volume * 1e-9, rel=2e-3)
+
+
+def klein_bottle() -> trimesh.Trimesh:
+    """A closed surface with one side."""
+    u, v = np.meshgrid(np.arange(24), np.arange(12), indexing='ij')
+    a, b = u * 2 * np.pi / 24, (v + 0.5) * 2 * np.pi / 12
+    r = 20 + 8 * (np.cos(a / 2) * np.sin(b) - np.sin(a / 2) * np.sin(2 * b))
+    z = 8 * (np.sin(a / 2) * np.sin(b) + np.cos(a / 2) * np.sin(2 * b))
+    vertices = np.stack([r * np.cos(a), r * np.sin(a), z], axis=-1).reshape(-1, 3)
+
+    def index(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        wrapped = np.where(i == 24, -j - 1, j) % 12  # glued with a flip
+        return (i % 24) * 12 + wrapped
+
+    p, q = index(u, v), index(u + 1, v)
+    s, t = index(u, v + 1), index(u + 1, v + 1)
+    faces = np.concatenate(
+        [np.stack([p, q, t], -1).reshape(-1, 3), np.stack([p, t, s], -1).reshape(-1, 3)]
+    )
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+FLAT = trimesh.Trimesh([[0, 0, 0], [40, 0, 0], [0, 40, 0]], [[0, 1, 2], [0, 2, 1]], process=False)
+
+
+@pytest.mark.parametrize(
+    ('mesh', 'unit', 'named'),
+    [
+        (without(*range(60)), 'mm', ['not closed', 'edges without two', 'Close Holes']),
+        (BODY, 'm', ['78 m long', 'cm or mm', '--unit']),
+        (trimesh.creation.icosphere(radius=1e-5), 'm', ['2e-05 m long', 'scale it']),
+        (klein_bottle(), 'mm', ['no inside and outside']),
+        (FLAT, 'mm', ['not closed', '3 edges']),
+    ],
+    ids=['open', 'unit', 'tiny', 'one-sided', 'flat'],
+)
+def test_surface_that_cannot_be_filled_is_refused_in_one_sentence_with_a_remedy(
+    tmp_path: Path, mesh: trimesh.Trimesh, unit: str, named: list[str]
+) -> None:
+    path = saved(tmp_path, mesh, 'organ.ply')
+    with pytest.raises(SessionError) as refused:
+        read_surface(path, unit)
+    said = str(refused.value)
+    assert said.startswith(str(path)) and '\n' not in said and ': ' in said
+    assert all(name in said for name in named), said
+
+
+def nan() -> bytes:
+    mesh = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, np.nan]], [[0, 1, 2]], process=False)
+    return bytes(mesh.export(file_type='ply'))
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'named'),
+    [
+        ('organ.stl', b'', 'is empty'),
+        ('organ.stl', b'not a surface at all', 'organ.stl'),
+        ('organ.qqq', b'abc', 'STL, PLY or OBJ'),
+        ('organ.obj', b'v 0 0 0\nv 1 0 0\nv 0 1 0\n', 'organ.obj'),
+        ('organ.ply', nan(), 'not numbers'),
+    ],
+)
+def test_file_without_a_surface_is_refused_in_one_sentence(
+    tmp_path: Path, name: str, content: bytes, named: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SessionError, match=named) as refused:
+        read_surface(tmp_path / name, 'mm')
+    assert '\n' not in str(refused.value)
+
+
+def test_missing_file_and_huge_surface_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = saved(tmp_path, BODY)
+    with pytest.raises(SessionError, match=r'did you mean organ\.stl'):
+        read_surface(tmp_path / 'orgn.stl', 'mm')
+    monkeypatch.setattr('session.surface_import.MOST_TRIANGLES', 100)
+    with pytest.raises(SessionError, match='simplify it'):
+        read_surface(path, 'mm')
+
+
+def options(surface: Path, output: Path, **others: object) -> ImportOptions:
+    given = {'unit': 'mm', 'edge': 0.009, 'rests_on': '-z', 'as_json': True} | others
+    return ImportOptions(surface, output, **given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ('others', 'named'),
+    [
+        ({'edge': 1e-4}, 'tetrahedra, more than'),
+        ({'edge': 0.5}, 'more than half of the size'),
+        ({'rests_on': 'down'}, '--rests-on down: one of -z'),
+    ],
+)
+def test_request_that_makes_no_mesh_is_refused_with_what_would(
+    tmp_path: Path, others: dict[str, object], named: str
+) -> None:
+    with pytest.raises(SessionError, match=named):
+        import_mesh(options(saved(tmp_path, BODY), tmp_path / 'made', **others))
+    assert not list(tmp_path.glob('made*'))
+
+
+def test_without_the_mesher_it_is_said_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mesher, 'find_spec', lambda name: None)
+    with pytest.raises(SessionError, match=r'pip install -r requirements-mesh\.txt'):
+        import_mesh(options(saved(tmp_path, BODY), tmp_path / 'made'))
+
+
+def test_mesher_that_dies_is_an_error_and_not_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(*_: object, **__: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess([], -6, '', 'terminate called\nout of cheese\n')
+
+    monkeypatch.setattr(subprocess, 'run', die)
+    with pytest.raises(SessionError, match='out of cheese; try another --edge'):
+        mesher.fill(BODY.vertices * 1e-3, BODY.faces, 0.009, 0.001)
+
+
+@pytest.fixture(scope='module')
+def imported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
+    """A body imported, resting on its side +x; the scene and the report."""
+    folder = tmp_path_factory.mktemp('organ')
+    surface = saved(folder, without(17))
+    command = [sys.executable, '-m', 'session.cli', 'import-mesh', str(surface), '--json']
+    command += ['--edge', '0.009', '-o', str(folder / 'mine')]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == Status.OK, done.stderr
+    return folder / 'mine.yaml', json.loads(done.stdout)
+
+
+def test_imported_mesh_is_the_body_and_the_report_says_how_good_it_is(
+    imported: tuple[Path, dict[str, object]],
+) -> None:
+    path, report = imported
+    mesh = make_simulation(load_scene(str(path)).tissue)[0].mesh
+    assert report['tetrahedra'] == len(mesh.tetrahedra) > 200
+    assert mesh.volumes().min() == pytest.approx(report['least_volume'])
+    assert mesh.volumes().sum() == pytest.approx(BODY.volume * 1e-9, rel=0.1)
+    assert 0 < report['surface_moved'] < 0.5 * 0.009  # type: ignore[operator]
+    assert 0 < report['radius_ratio_least'] <= report['radius_ratio_median'] < 1  # type: ignore[operator]
+    assert any('holes' in sentence for sentence in report['mended'])  # type: ignore[attr-defined]
+    assert mesh.rest[:, 2].min() == 0.0
+    assert np.ptp(mesh.rest, axis=0) == pytest.approx([0.078, 0.060, 0.036], rel=0.06)
+    held = mesh.rest[mesh.fixed == 1, 2]
+    assert 6 <= len(held) < len(mesh.rest) / 4
+    assert held.max() < mesh.rest[mesh.fixed == 0, 2].min() + 1e-12
+
+
+def test_imported_scene_is_pressed_and_cut_by_its_own_script(
+    imported: tuple[Path, dict[str, object]],
+) -> None:
+    scene = load_scene(str(imported[0]))
+    tissue = Tissue(make_simulation(scene.tissue)[0], make_method(scene.cutting))
+    session = InProcess(
+        ForcePath(scene.tool, scene.device, scene.haptics, scene.profile), tissue, 30.0
+    )
+    script = compile_script(scene.arm.script, scene.device.tissue_from_device)
+    before = len(tissue.simulation.mesh.tetrahedra)
+    forces = []
+    for tick in range(int(1000 * script.seconds)):
+        position = np.array(
+            [np.interp(tick / 1000, script.times, script.positions[:, axis]) for axis in range(3)]
+        )
+        session.tick(position)
+        forces.append(session.path.force_norm)
+        assert session.frame is None or not session.frame.diverged
+    cut = tissue.simulation.mesh.triangle_kind.sum()
+    assert max(forces[:500]) == 0.0  # it starts above the organ
+    assert 0.1 < max(forces) < scene.profile.max_force
+    assert forces[-1] == 0.0
+    assert cut > 0
+    assert len(tissue.simulation.mesh.tetrahedra) != before
+
+
+@pytest.mark.parametrize('side', SIDES)
+def test_side_on_which_it_rests_is_turned_down_without_mirroring(side: str) -> None:
+    from session.import_mesh import _placed
+    from session.surface_import import Surface
+
+    box = trimesh.creation.box([0.04, 0.05, 0.06])
+    axis, sign = SIDES[side]
+    # a dent in the middle of the side that is to be down
+    tip = np.zeros(3)
+    tip[axis] = -sign * 0.02
+    vertices = np.vstack((box.vertices, tip))
+    surface = Surface(vertices, np.asarray(box.faces, np.int32), 1.2e-4, 1, ())
+    placed = _placed(surface, side)
+    solid = trimesh.Trimesh(placed.vertices[:8], box.faces, process=False)
+    assert solid.volume == pytest.approx(box.volume)
+    assert placed.vertices[:, 2].min() == 0.0
+    size = [0.04, 0.05, 0.06]
+    assert placed.vertices[8, 2] == pytest.approx(size[axis] / 2 - 0.02)
+
+
+def test_height_is_that_of_the_solid_over_a_place() -> None:
+    nodes = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    tetrahedra = np.array([[0, 1, 2, 3]], np.int32)
+    assert height(nodes, tetrahedra, np.array([0.25, 0.25])) == pytest.approx(0.5)
+    assert height(nodes, tetrahedra, np.array([0.8, 0.8])) == -np.inf
+
+
+def test_output_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+    surface = saved(tmp_path, BODY)
+    (tmp_path / 'made.yaml').write_text('mine')
+    with pytest.raises(SessionError, match='exists'):
+        import_mesh(options(surface, tmp_path / 'made'))
+    with pytest.raises(SessionError, match='without an ending'):
+        import_mesh(options(surface, tmp_path / 'made.msh'))
