@@ -22,6 +22,7 @@ from bags.parameters import ParameterCollector
 from bags.qos import OfferedQos
 from bags.sequences import SequenceCounter
 from bags.writer import BagWriter
+from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
 from tissue_sim.ros import (
     ARM,
     CONTACT,
@@ -113,11 +114,10 @@ class Recorder(Node):
 
     def __init__(self) -> None:
         super().__init__('recorder')
-        folder = str(self.declare_parameter('bag', '').value)
+        folder = str(parameter(self, 'bag', '', 'new folder for the bag'))
         if not folder:
             raise BagError('the parameter "bag" is missing: name the folder of the new bag')
-        scene = str(self.declare_parameter('scene', '').value)
-        seed = int(self.declare_parameter('seed', 0).value)
+        scene, seed = scene_parameter(self), seed_parameter(self)
         self.writer = BagWriter(Path(folder), custom_data=_custom_data(scene, seed))
         self._streams: dict[str, _Stream] = {}
         self._unrecorded: dict[str, str] = {}

@@ -19,6 +19,7 @@ from tissue_sim.blade import Sweep
 from tissue_sim.errors import MeshError
 from tissue_sim.mesh import TetMesh
 from tissue_sim.messages import delta_into, packed
+from tissue_sim.parameters import scene_parameter, seed_parameter
 from tissue_sim.replica import MeshReplica
 from tissue_sim.scene_file import read_section
 
@@ -34,8 +35,8 @@ class CuttingNode(Node):
 
     def __init__(self) -> None:
         super().__init__('cutting')
-        scene = Path(self.declare_parameter('scene', '').value)
-        self.declare_parameter('seed', 0)
+        scene = Path(scene_parameter(self))
+        seed_parameter(self)
         self._settings = read_section(scene, 'cutting', CuttingSettings)
         warm_up(self._settings)
         self._method = make_method(self._settings)

@@ -22,6 +22,7 @@ from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.stream_watch import StreamWatch
 from haptic_bridge.wire import PoseStampedCodec, TwistStampedCodec, WireError, WrenchStampedCodec
+from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
 from tissue_sim.ros import (
     ARM,
     EVENTS,
@@ -41,6 +42,8 @@ from tissue_sim.scene_file import read_section
 from tissue_sim.timing import Durations, PeriodicLoop
 
 _LONGEST_CATCH_UP = 50
+_LONGEST_SCRIPT = 86400.0
+"""[s]"""
 _NO_TORQUE = (0.0, 0.0, 0.0)
 
 
@@ -65,19 +68,20 @@ class ArmNode(Node):
 
     def __init__(self) -> None:
         super().__init__('emulated_arm')
-        scene = Path(self.declare_parameter('scene', '').value)
-        seconds = float(self.declare_parameter('seconds', 0.0).value)
-        seed = self.declare_parameter('seed', 0).value
-        if not math.isfinite(seconds) or seconds < 0:
-            raise ValueError(f'parameter seconds is {seconds}: use 0 or a duration')
+        scene = Path(scene_parameter(self))
+        text = "duration that the script is stretched to [s]; 0: the script's own"
+        seconds = float(parameter(self, 'seconds', 0.0, text, within=(0.0, _LONGEST_SCRIPT)))
+        seed = seed_parameter(self)
         settings = read_section(scene, 'arm', ArmSettings)
         device = read_section(scene, 'device', DeviceSettings)
         script = compile_script(settings.script, device.tissue_from_device, seconds)
         body_force = device.force_frame == 'body'
         self._convention = DeviceConvention(device)
         self._frame = device.tissue_from_device
-        self._waits = bool(self.declare_parameter('wait_for_bridge', True).value)
-        guided = bool(self.declare_parameter('guided', False).value)
+        text = 'begin the script when the bridge commands; else when the arm itself is ENABLED'
+        self._waits = bool(parameter(self, 'wait_for_bridge', True, text))
+        text = 'the hand has no script: it stays at its start until it is given goals'
+        guided = bool(parameter(self, 'guided', False, text))
 
         def new_arm() -> EmulatedArm:
             hand = Hand(settings.hand, script, seed)
@@ -95,7 +99,7 @@ class ArmNode(Node):
         self._script = script
         self._watch = StreamWatch(f'{ARM}/servo_cf')
         self._machine = OperatingStateMachine(lambda: self._watch.cause(time.monotonic_ns()))
-        if self.declare_parameter('auto_enable', True).value:
+        if parameter(self, 'auto_enable', True, 'start in the state ENABLED'):
             self._machine.command('enable')
         self._loop = PeriodicLoop(settings.rate)
         self._force_age = Durations('force_age')

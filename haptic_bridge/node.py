@@ -31,6 +31,7 @@ from haptic_bridge.wire import (
 )
 from tissue_sim import ros
 from tissue_sim.mesh_follower import MeshFollower, require_frame
+from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
 from tissue_sim.scene_file import read_section
 from tissue_sim.timing import Durations, PeriodicLoop
 
@@ -125,8 +126,10 @@ class HapticBridge(Node):
 
     def __init__(self) -> None:
         super().__init__('haptic_bridge')
-        scene = Path(self.declare_parameter('scene', '').value)
-        self._auto_enable = bool(self.declare_parameter('auto_enable', False).value)
+        scene = Path(scene_parameter(self))
+        seed_parameter(self)
+        text = 'enter ENABLED, once, when device, force and surface are fresh'
+        self._auto_enable = bool(parameter(self, 'auto_enable', False, text))
         device = read_section(scene, 'device', DeviceSettings)
         tool = read_section(scene, 'tool', ToolSettings)
         haptics = read_section(scene, 'haptics', HapticsSettings)
@@ -150,7 +153,8 @@ class HapticBridge(Node):
         self._interface = StateInterface(self, 'haptic_bridge', self._machine)
         self._device = DeviceState(self, ros.ARM, self._machine)
         self._button = HoldButton(self, ros.ARM, self._machine) if device.hold_button else None
-        self.declare_parameter('force_scale', haptics.force_scale)
+        text = 'hand force over tissue force [-], above 0 to 100'
+        parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
         self.add_on_set_parameters_callback(self._set_parameters)
         self._epoch = time.time_ns() - time.monotonic_ns()
         self._stale_trips = 0
@@ -174,12 +178,12 @@ class HapticBridge(Node):
         self._diagnostics.publish()
 
     def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            if parameter.name != 'force_scale':
-                reason = f'{parameter.name} is read once, at the start of the node'
+        for given in parameters:
+            if given.name != 'force_scale':
+                reason = f'{given.name} is read once, at the start of the node'
                 return SetParametersResult(successful=False, reason=reason)
             try:
-                self._path.scale_force(parameter.value)
+                self._path.scale_force(given.value)
             except ValueError as error:
                 reason = ' '.join(str(error).split())
                 return SetParametersResult(successful=False, reason=reason)

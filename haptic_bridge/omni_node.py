@@ -10,6 +10,7 @@ from sensor_msgs.msg import Joy
 from haptic_bridge.omni import ForceLatch, OmniConvention
 from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.wire import PoseStampedCodec, TwistStampedCodec, WireError, WrenchStampedCodec
+from tissue_sim.parameters import parameter
 from tissue_sim.ros import (
     ARM,
     EVENTS,
@@ -45,9 +46,17 @@ class OmniAdapter(Node):
         super().__init__('omni_adapter')
         default = OmniConvention()
         convention = OmniConvention(
-            str(self.declare_parameter('unit', default.unit).value),
-            str(self.declare_parameter('force_axes', default.force_axes).value),
-            float(self.declare_parameter('timeout', default.timeout).value),
+            str(parameter(self, 'unit', default.unit, 'of length in omni/state: m or mm')),
+            str(parameter(self, 'force_axes', default.force_axes, "frame of the driver's force")),
+            float(
+                parameter(
+                    self,
+                    'timeout',
+                    default.timeout,
+                    'age of a force command at which it becomes zero [s]',
+                    within=(0.005, 0.3),
+                )
+            ),
         )
         try:
             from omni_msgs.msg import OmniButtonEvent, OmniFeedback, OmniState

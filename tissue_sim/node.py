@@ -16,6 +16,7 @@ from tissue_sim.assembly import make_simulation
 from tissue_sim.contact import Command, Frame, ToolContact
 from tissue_sim.errors import MeshError
 from tissue_sim.mesh import Touched
+from tissue_sim.parameters import scene_parameter, seed_parameter
 from tissue_sim.plan_watch import PlanWatch
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
@@ -33,8 +34,8 @@ class TissueSimNode(Node):
 
     def __init__(self) -> None:
         super().__init__('tissue_sim')
-        scene = Path(self.declare_parameter('scene', '').value)
-        self.declare_parameter('seed', 0)
+        scene = Path(scene_parameter(self))
+        seed_parameter(self)
         settings = read_section(scene, 'tissue', TissueSettings)
         self._scene = scene.stem
         self._simulation, plan = make_simulation(settings)

@@ -22,6 +22,7 @@ from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
 from haptic_bridge.wire import ContactCodec, PoseStampedCodec, StampedCodec, WrenchStampedCodec
 from tissue_sim import ros
 from tissue_sim.mesh_follower import MeshFollower
+from tissue_sim.parameters import parameter, scene_parameter
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
 from tissue_sim.share import share_folder
@@ -85,18 +86,22 @@ class ViewerNode(Node):
 
     def __init__(self) -> None:
         super().__init__('viewer')
-        scene = Path(self.declare_parameter('scene', '').value)
-        host = str(self.declare_parameter('host', '127.0.0.1').value)
-        port = int(self.declare_parameter('port', 8080).value)
-        colouring = str(self.declare_parameter('marker_colour', 'displacement').value)
+        scene = Path(scene_parameter(self))
+        host = str(parameter(self, 'host', '127.0.0.1', 'address that the page is served on'))
+        text = 'port of the page; 0: one that is free'
+        port = int(parameter(self, 'port', 8080, text, within=(0, 65535)))
+        text = 'of the tissue in viewer/markers: displacement or von_mises'
+        colouring = str(parameter(self, 'marker_colour', 'displacement', text))
         if colouring not in get_args(Colouring):
             known = ' or '.join(get_args(Colouring))
             raise ValueError(f'marker_colour is {colouring!r}: use {known}')
-        largest = float(self.declare_parameter('marker_largest', 0.01).value)
+        text = 'what has the last colour [m] or [Pa]'
+        largest = float(parameter(self, 'marker_largest', 0.01, text))
         if not largest > 0:
             raise ValueError(f'marker_largest is {largest}: use a number above 0')
         self._colouring: tuple[Any, float] = colouring, largest
-        self._launched = bool(self.declare_parameter('session', False).value)
+        text = 'a launcher reads standard output and answers on standard input'
+        self._launched = bool(parameter(self, 'session', False, text))
         self._take_scene(scene)
         self._follower = MeshFollower(self)
         self._contact = Stream(self, Contact, ros.CONTACT, ContactCodec())

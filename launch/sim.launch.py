@@ -1,0 +1,12 @@
+"""The simulation's side alone: tissue, cutting, recorder; `bridge.launch.py` where the arm is."""
+
+from launch import LaunchDescription
+from session.launching import declared, environment, nodes
+
+NODES = ('tissue_sim', 'cutting', 'recorder')
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Declares the arguments and starts the nodes."""
+    arguments = declared('scene', 'seed', 'bag', 'namespace')
+    return LaunchDescription([*arguments, *environment(), *nodes(NODES)])

@@ -1,0 +1,65 @@
+"""Parameters of nodes, each with what it means, its unit and range, and whether it may change."""
+
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+
+LARGEST_SEED = 2**63 - 1
+
+
+def parameter(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    *,
+    within: tuple[float, float] | None = None,
+    constraints: str = '',
+    settable: bool = False,
+) -> Any:
+    """Declares a parameter and returns its value.
+
+    Args:
+        node: that has it.
+        name: of it.
+        default: value without one from outside; its type is the parameter's.
+        description: what it means, with its unit.
+        within: least and largest value, both allowed.
+        constraints: what else it must be, in words.
+        settable: may change while the node runs; else it is read-only after the start.
+
+    Raises:
+        ValueError: it was given a value of another type, or out of its range.
+    """
+    descriptor = ParameterDescriptor(
+        description=description, additional_constraints=constraints, read_only=not settable
+    )
+    if within is not None and isinstance(default, int):
+        low, high = map(int, within)
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+    elif within is not None:
+        low, high = within
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    try:
+        return node.declare_parameter(name, default, descriptor).value
+    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+        wanted = f', {within[0]:g} to {within[1]:g}' if within else ''
+        raise ValueError(
+            f'parameter {name} of {node.get_name()} must be of type {type(default).__name__}'
+            f'{wanted} ({description}): {error}'
+        ) from None
+
+
+def scene_parameter(node: Node) -> str:
+    """Path of the scene file, `scene`."""
+    return str(
+        parameter(node, 'scene', '', 'path of the scene file', constraints='an existing .yaml file')
+    )
+
+
+def seed_parameter(node: Node) -> int:
+    """Seed of everything random in the node, `seed`."""
+    text = 'seed of everything random [-]'
+    return int(parameter(node, 'seed', 0, text, within=(0, LARGEST_SEED)))
