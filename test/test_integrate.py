@@ -1,0 +1,136 @@
+"""What docs/topics.md and docs/integrate.md say, as they say it."""
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live import free_domain
+from rclpy.qos import QoSProfile
+from test_docs import made
+
+from bags.reader import open_bag
+from haptic_bridge.wire import WrenchStampedCodec
+from session import topic_reference
+from session.graph import BRIDGE_NODE, CUTTING_NODE, TISSUE_NODE, node_command, node_environment
+from session.processes import Supervisor
+from tissue_sim import ros
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / 'docs' / 'integrate.md').read_text(encoding='utf-8')
+PRESS, LARGEST = re.findall(r'```python\n(.*?)```', PAGE, re.DOTALL)
+SAMPLES = ROOT / 'bags' / 'samples'
+
+
+# Topics.
+
+
+def test_reference_of_topics_is_that_of_the_interfaces() -> None:
+    text = topic_reference.FILE.read_text(encoding='utf-8')
+    tables = text.partition(topic_reference.MARK)[2].strip()
+    renew = 'run `python -m session.topic_reference`'
+    assert tables == topic_reference.reference().strip(), renew
+
+
+def test_reference_names_every_topic_and_service_that_the_nodes_make() -> None:
+    types = {(t.name, t.type) for t in topic_reference.TOPICS}
+    types |= {(name, kind) for name, kind, _, _ in topic_reference.SERVICES}
+    short = {(name.lstrip('/'), kind.rpartition('/')[2]) for name, kind in types}
+    # the query of the state has the topic's name, and is counted once there
+    assert short - {(n, k) for n, k in short if k == 'TriggerOperatingState'} == made()
+    for _, kind in types:
+        package, folder, name = kind.split('/')
+        assert hasattr(importlib.import_module(f'{package}.{folder}'), name)
+
+
+def test_every_interface_has_its_table_with_a_meaning_of_what_has_a_unit() -> None:
+    text = topic_reference.reference()
+    for file in topic_reference.interface_files():
+        assert f'\n## {file.suffix[1:]}/{file.stem}\n' in text
+        fields = re.findall(r'^[\w/]+(?:\[\w*\])? +(\w+) *(?:#|$)', file.read_text(), re.MULTILINE)
+        section = text.partition(f'## {file.suffix[1:]}/{file.stem}\n')[2].partition('\n## ')[0]
+        assert [f for f in fields if f'| `{f}` |' not in section] == []
+
+
+def offered() -> dict[str, QoSProfile]:
+    """QoS of what the nodes publish, by topic, from the sources."""
+    found = {}
+    nodes = [*ROOT.glob('tissue_sim/*.py'), *ROOT.glob('haptic_bridge/*.py')]
+    for path in [*nodes, ROOT / 'viewer' / 'node.py']:
+        if path.name in ('probe_node.py', 'omni_node.py'):
+            continue
+        for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if getattr(getattr(call, 'func', None), 'attr', '') == 'create_publisher':
+                assert isinstance(call, ast.Call)
+                _, topic, qos = map(ast.unparse, call.args[:3])
+                if path.parent.name == 'viewer' and topic not in ('ros.HAND', 'ros.MARKERS'):
+                    continue  # commands to others
+                for owner in (ros.ARM, 'haptic_bridge') if 'name' in topic else ('',):
+                    scope = {'ros': ros, 'name': owner, **vars(ros)}
+                    found[eval(topic, scope)] = eval(qos, scope)
+    return found
+
+
+def test_reference_says_the_qos_that_is_offered() -> None:
+    told = {t.name: t.qos for t in topic_reference.TOPICS}
+    asked_for = {name for name in told if name.endswith('/state_command')}
+    seen = offered()
+    assert told.keys() - asked_for <= seen.keys()
+    for name in told.keys() - asked_for:
+        assert topic_reference.describe(told[name]) == topic_reference.describe(seen[name]), name
+
+
+# The examples.
+
+
+def test_example_that_reads_a_bag_finds_the_largest_force(tmp_path: Path) -> None:
+    folder = SAMPLES / 'format_2' / 'straight_cut'
+    script = tmp_path / 'largest_force.py'
+    script.write_text(LARGEST)
+    done = subprocess.run(
+        [sys.executable, '-I', str(script), str(folder)], capture_output=True, text=True, check=True
+    )
+    codec = WrenchStampedCodec()
+    forces = [
+        np.linalg.norm(codec.decode(m.data).values[:3])
+        for m in open_bag(folder).messages(['/arm/servo_cf'])
+    ]
+    assert done.stdout.startswith(f'{max(forces):.3f} N after')
+    assert max(forces) > 0.1
+
+
+@pytest.mark.slow
+def test_example_that_drives_the_tool_presses_and_follows_the_mesh(tmp_path: Path) -> None:
+    assert len(PRESS.splitlines()) <= 60
+    script = tmp_path / 'press.py'
+    script.write_text(PRESS)
+    scene = {'scene': str(SAMPLES / 'palpation.yaml')}
+    nodes = [
+        node_command(BRIDGE_NODE, scene | {'auto_enable': True}),
+        node_command(TISSUE_NODE, scene),
+        node_command(CUTTING_NODE, scene),
+    ]
+    environment = node_environment(free_domain())
+    with Supervisor(nodes, tmp_path / 'log', environment, lambda event: None) as supervisor:
+        assert supervisor.start()
+        done = subprocess.run(
+            [sys.executable, str(script)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        outcome = supervisor.end()
+    assert done.returncode == 0, done.stderr
+    assert not outcome.deaths
+    said = re.fullmatch(r'revision (\d+): ([\d.]+) mm deep, ([\d.]+) N\n', done.stdout)
+    assert said, done.stdout
+    revision, deep, force = map(float, said.groups())
+    assert revision > 10
+    assert 0.2 < deep < 13.5  # it goes 7.5 mm below where it touches, and the proxy holds it
+    assert force > 0.1
