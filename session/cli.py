@@ -459,6 +459,16 @@ def doctor(
     )
 
 
+@app.command(epilog=EXIT_STATUSES)
+def completion(
+    shell: Annotated[Literal['bash', 'zsh'], typer.Argument(help='Which shell.')],
+) -> None:
+    """Print what makes the shell complete commands: eval "$(./trainer completion bash)"."""
+    from session.completion import script
+
+    print(script(app, shell))
+
+
 @app.command(
     epilog='Exit status: that of the program.',
     context_settings={'allow_extra_args': True, 'ignore_unknown_options': True},

@@ -11,6 +11,7 @@ import pytest
 
 from haptic_bridge.operating_state import crtk_types
 from session import scene_reference
+from session.status import Status
 from tissue_sim import ros
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -143,3 +144,17 @@ def test_every_section_of_a_scene_has_its_model() -> None:
     from tissue_sim.scene_file import SECTIONS
 
     assert tuple(scene_reference.MODELS) == SECTIONS
+
+
+# Exit statuses.
+
+
+def test_exit_statuses_are_those_of_the_commands_and_of_the_launcher() -> None:
+    text = TEXTS[ROOT / 'docs' / 'troubleshooting.md'].partition('## Exit statuses')[2]
+    rows = dict(re.findall(r'^\| (\d+) \| (.+) \|$', text, re.MULTILINE))
+    assert {str(int(s)): s.meaning for s in Status}.items() <= rows.items()
+    launcher = (ROOT / 'trainer').read_text(encoding='utf-8')
+    numbers = re.findall(r'^(?:NO_\w+|DISK_FULL)[\w, ]* = ([\d, ]+)$', launcher, re.MULTILINE)
+    own = {n for line in numbers for n in line.split(', ')}
+    assert len(own) == 10 and own <= rows.keys()
+    assert rows.keys() == own | {str(int(s)) for s in Status}
