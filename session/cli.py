@@ -1,9 +1,10 @@
 """The command line: `./trainer COMMAND`, or `python -m session.cli COMMAND`."""
 
+import errno
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 import typer
 from rich.console import Console
@@ -207,12 +208,15 @@ def resimulate(
             'recorded hand meets the changed tissue, and the differences are shown.',
         ),
     ] = None,
+    as_json: Annotated[
+        bool, typer.Option('--json', help='Print the answer as JSON on standard output.')
+    ] = False,
 ) -> None:
     """Compute a recorded session again: identical, or where it first differs. Needs no ROS."""
     from session.recorded_scene import parse_changes
     from session.resimulate import resimulate as compute
 
-    raise typer.Exit(int(compute(bag, parse_changes(changes or []))))
+    raise typer.Exit(int(compute(bag, parse_changes(changes or []), as_json=as_json)))
 
 
 @app.command(epilog=EXIT_STATUSES)
@@ -526,9 +530,31 @@ def main(arguments: list[str] | None = None) -> None:
     except ValueError as error:
         if not _is_users(error):
             raise
-        console = Console(stderr=True, soft_wrap=True)
-        console.print(f'[bold red]error:[/] {escape(str(error))}', highlight=False)
-        raise SystemExit(int(Status.BAD_INPUT)) from None
+        _refuse(str(error))
+    except OSError as error:
+        if error.filename is None or error.errno not in _REMEDIES:
+            raise
+        why, remedy = (error.strerror or '').lower(), _REMEDIES[error.errno]
+        _refuse(f'{error.filename}: {why}: {remedy}')
+
+
+_ELSEWHERE = 'name another place, or mend its rights'
+_REMEDIES = {
+    errno.ENOENT: 'check the path, and that its folder exists',
+    errno.ENOTDIR: 'check the path: a part of it is no folder',
+    errno.EISDIR: 'name a file, not a folder',
+    errno.EACCES: _ELSEWHERE,
+    errno.EPERM: _ELSEWHERE,
+    errno.EROFS: _ELSEWHERE,
+    errno.ENOSPC: 'make room, or name a place on another disk',
+}
+"""What to do about a file that the system refuses, by the number of its error."""
+
+
+def _refuse(sentence: str) -> NoReturn:
+    console = Console(stderr=True, soft_wrap=True)
+    console.print(f'[bold red]error:[/] {escape(sentence)}', highlight=False)
+    raise SystemExit(int(Status.BAD_INPUT)) from None
 
 
 def _is_users(error: ValueError) -> bool:

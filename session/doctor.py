@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from session.domain import FIRST_PORT, LARGEST_DOMAIN, PORTS_PER_DOMAIN
 from session.status import Status
@@ -91,6 +91,50 @@ def run_doctor(
     if as_json:
         print(json.dumps({'ok': not failed, 'checks': [asdict(f) for f in findings]}, indent=2))
     return Status.FAILED if failed else Status.OK
+
+
+def examine(launcher: Any, home: Any, *, as_json: bool) -> int:
+    """What the launcher's `doctor` does, before anything is set up too.
+
+    Args:
+        launcher: its module, which knows what setting up needs and has done.
+        home: where it sets up, and for which ROS.
+        as_json: see `run_doctor`.
+    """
+
+    def check(name: str, action: Callable[[], str]) -> Finding:
+        try:
+            return Finding(name, 'ok', action())
+        except launcher.SetupError as error:
+            found, _, remedy = str(error).partition(': ')
+            return Finding(name, 'error', found, remedy)
+
+    def python() -> str:
+        facts = launcher.choose_python(home)
+        return f'{".".join(map(str, facts["version"]))} at {facts["executable"]}'
+
+    def compiler() -> str:
+        launcher.check_build_tools()
+        return 'C, C++, CMake and a make program are there'
+
+    def fits(step: str) -> bool:
+        key, _ = launcher.steps()[step]
+        return bool(launcher.done(home, step, key(home)))
+
+    checks = [
+        lambda: check('python', python),
+        lambda: check('compiler', compiler),
+        lambda: set_up(
+            home.folder,
+            home.jazzy,
+            ready=launcher.prepared(home),
+            needed=launcher.NEEDED_SPACE,
+        ),
+        lambda: kernel_cache(home.numba_cache, current=fits('kernels')),
+    ]
+    environment = launcher.node_environment(home, dict(os.environ))
+    interpreter = str(home.python) if fits('interfaces') else None
+    return int(run_doctor(checks, interpreter, environment, as_json=as_json))
 
 
 def line(finding: Finding, *, colour: bool) -> str:

@@ -84,6 +84,19 @@ class Run:
         )
         return table
 
+    def figures(self) -> dict[str, float]:
+        """In SI units, for machines."""
+        return {
+            'largest_force': self.peak,
+            'mean_force_in_contact': self.mean,
+            'contact': self.contact_time,
+            'incision_area': self.area,
+            'elements_cut': self.elements_cut,
+            'tetrahedra': self.tetrahedra,
+            'substeps': self.substeps,
+            'frames_taken_back': self.diverged,
+        }
+
     @property
     def peak(self) -> float:
         return float(self.forces.max(initial=0.0))

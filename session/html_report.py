@@ -66,7 +66,7 @@ def write_report(folder: Path, file: Path) -> None:
     """
     if file.suffix != '.html':
         raise SessionError(f'{file} is no page: end its name in .html')
-    if not file.parent.is_dir():
+    if file.parent != folder and not file.parent.is_dir():
         raise SessionError(f'{file.parent} does not exist: make it first, the report goes into it')
     bag = open_bag(folder)
     story = read_story(folder, None)

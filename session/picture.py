@@ -67,7 +67,7 @@ def make_picture(bag: Path, file: Path, at: float | None) -> None:
     """
     if file.suffix not in FORMATS:
         raise SessionError(f'{file} is no picture: end its name in {", ".join(FORMATS)}')
-    if not file.parent.is_dir():
+    if file.parent != bag and not file.parent.is_dir():
         raise SessionError(f'{file.parent} does not exist: make it first, the picture goes into it')
     story = read_story(bag, at)
     with mpl.rc_context(STYLE):

@@ -1,8 +1,11 @@
 """A recorded session, computed again: the same, or where it first differs; or with changes."""
 
+import json
+import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +28,13 @@ from session.status import Status
 from tissue_sim.assembly import make_simulation
 
 
-def resimulate(folder: Path, changes: Mapping[str, str]) -> Status:
+def resimulate(folder: Path, changes: Mapping[str, str], *, as_json: bool = False) -> Status:
     """Computes a session again and says what came of it.
 
     Args:
         folder: of the bag.
         changes: by dotted key of the scene; without any the numbers must be those recorded.
+        as_json: print what came of it as JSON.
 
     Raises:
         BagError, SessionError, SceneError, SettingsError: it cannot be computed.
@@ -42,8 +46,8 @@ def resimulate(folder: Path, changes: Mapping[str, str]) -> Status:
         if changes:
             changed = load_scene(str(restore_scene(bag, Path(temporary), changes)))
             warm_up_cutting(changed.cutting)
-            return _experiment(bag, scene, changed, changes)
-        return _verify(bag, scene)
+            return _experiment(bag, scene, changed, changes, as_json=as_json)
+        return _verify(bag, scene, as_json=as_json)
 
 
 def recomputation(scene: Scene) -> Recomputation:
@@ -79,7 +83,7 @@ def pose_check(scene: Scene) -> Callable[[Any, Any], float]:
     return distance
 
 
-def _verify(bag: Bag, scene: Scene) -> Status:
+def _verify(bag: Bag, scene: Scene, *, as_json: bool) -> Status:
     console, notes = Console(soft_wrap=True), Console(stderr=True)
     with Progress(console=notes, transient=True) as progress:
         bar = progress.add_task('computing frames')
@@ -91,7 +95,13 @@ def _verify(bag: Bag, scene: Scene) -> Status:
             lambda done, total: progress.update(bar, completed=done, total=total),
         )
         took = time.monotonic() - began
-    console.print(*verdict(result, took), sep='\n', highlight=False)
+    if as_json:
+        told = asdict(result) | {'identical': result.difference is None, 'computed_in': took}
+        if result.difference and math.isinf(result.difference.size):
+            told['difference']['size'] = None
+        print(json.dumps(told, indent=2))
+    else:
+        console.print(*verdict(result, took), sep='\n', highlight=False)
     return Status.FAILED if result.difference else Status.OK
 
 
@@ -116,11 +126,17 @@ def verdict(result: Comparison, took: float) -> list[str]:
     return [f'{where}: {escape(result.difference.what)}', *lines]
 
 
-def _experiment(bag: Bag, scene: Scene, changed: Scene, changes: Mapping[str, str]) -> Status:
+def _experiment(
+    bag: Bag, scene: Scene, changed: Scene, changes: Mapping[str, str], *, as_json: bool
+) -> Status:
     notes = Console(stderr=True)
     with notes.status('computing the session as recorded'):
         before = run_experiment(bag, scene, recomputation(scene))
     with notes.status('computing the session as changed'):
         after = run_experiment(bag, changed, recomputation(changed))
-    Console().print(before.table(after, changes))
+    if as_json:
+        runs = {'recorded': before.figures(), 'changed': after.figures()}
+        print(json.dumps({'changes': dict(changes), **runs}, indent=2))
+    else:
+        Console().print(before.table(after, changes))
     return Status.OK

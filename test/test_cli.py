@@ -50,6 +50,39 @@ def one_error_line(capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (('picture', 'nobag'), 'nobag'),
+        (('report', 'nobag'), 'nobag'),
+        (('picture', 'BAG', '-o', 'nowhere/x.png'), 'nowhere does not exist'),
+        (('report', 'BAG', '-o', '/proc/x.html'), '/proc/x.html: no such file'),
+        (('export', 'BAG', '/proc/x.vtk'), '/proc/x.vtk: no such file'),
+        (('import-mesh', 'no.stl', '-o', 'x'), 'no.stl'),
+        (('plan', '/etc'), '/etc is a folder'),
+    ],
+)
+def test_file_that_cannot_be_read_or_written_is_one_line_with_a_remedy(
+    arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sample = str(ROOT / 'bags' / 'samples' / 'format_2' / 'palpation')
+    assert trainer(*(sample if a == 'BAG' else a for a in arguments)) == Status.BAD_INPUT
+    line = one_error_line(capsys)
+    assert said in line
+    assert 'make it first, the' not in line or 'nowhere' in line
+
+
+def test_error_of_the_system_without_a_file_is_a_bug_and_raised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, 'input/output error')
+
+    monkeypatch.setattr(cli, 'app', fail)
+    with pytest.raises(OSError, match='input/output'):
+        cli.main([])
+
+
 def test_unknown_scene_names_the_near_match_and_all_there_are(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

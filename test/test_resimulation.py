@@ -1,5 +1,6 @@
 """A session is computed again from its bag bit for bit, and one change in the bag is caught."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -211,6 +212,10 @@ def test_the_command_says_identical(
         cli.main(['resimulate', str(made)])
     assert stopped.value.code == 0
     assert capsys.readouterr().out.startswith('identical\n')
+    with pytest.raises(SystemExit):
+        cli.main(['resimulate', str(made), '--json'])
+    told = json.loads(capsys.readouterr().out)
+    assert told['identical'] and told['difference'] is None and told['frames'] > 0
 
 
 def test_a_copy_has_the_same_messages(tmp_path: Path) -> None:

@@ -37,8 +37,8 @@ def parameter(
         description=description, additional_constraints=constraints, read_only=not settable
     )
     if within is not None and isinstance(default, int):
-        low, high = map(int, within)
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+        least, most = map(int, within)
+        descriptor.integer_range = [IntegerRange(from_value=least, to_value=most, step=1)]
     elif within is not None:
         low, high = within
         descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
