@@ -22,6 +22,7 @@ from session.status import Status
 from session.surface_import import Surface, read_surface
 from tissue_sim.assembly import make_simulation, make_task
 from tissue_sim.contact import Frame
+from tissue_sim.errors import MeshError
 from tissue_sim.mesh_checks import quality
 
 Points = NDArray[np.float64]
@@ -106,8 +107,11 @@ def import_mesh(options: ImportOptions) -> Status:
     _write(mesh_file, nodes, tetrahedra)
     text = scene_text(mesh_file.name, str(options.surface.name), nodes, tetrahedra, edge)
     scene_file.write_text(text, encoding='utf-8')
-    with console.status('examining what was made'):
-        report = _report(options, surface, edge, mesh_file, scene_file)
+    try:
+        with console.status('examining what was made'):
+            report = _report(options, surface, edge, mesh_file, scene_file)
+    except MeshError as error:
+        raise SessionError(f'{error}; both files are written: edit {scene_file}') from None
     _tell(report, as_json=options.as_json)
     return Status.OK
 

@@ -165,6 +165,38 @@ def _check_closed(path: Path, mesh: Any) -> None:
     )
 
 
+def _turn_shells(mesh: Any) -> None:
+    """Turns shells so that normals leave the solid: outward, but inward around a cavity."""
+    count = len(mesh.faces)
+    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=count)
+    faces = np.array(mesh.faces)
+    corners = mesh.vertices[faces]
+    volumes = np.linalg.det(corners) / 6
+    shells = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+    for shell in shells:
+        point = corners[shell[0]].mean(axis=0)
+        around = sum(
+            abs(_winding(corners[other], point)) > 0.5 for other in shells if other is not shell
+        )
+        wanted = 1 if around % 2 == 0 else -1
+        if volumes[shell].sum() * wanted < 0:
+            faces[shell] = faces[shell][:, ::-1]
+    mesh.faces = faces
+
+
+def _winding(corners: NDArray[np.float64], point: NDArray[np.float64]) -> float:
+    """How often a closed shell goes around a point: its solid angle over 4 pi.
+
+    By the formula of Van Oosterom and Strackee (IEEE Trans. Biomed. Eng. 30, 1983).
+    """
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    na, nb, nc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    ab, bc, ca = (np.einsum('ij,ij->i', x, y) for x, y in ((a, b), (b, c), (c, a)))
+    volume = np.einsum('ij,ij->i', a, np.cross(b, c))
+    angles = 2 * np.arctan2(volume, na * nb * nc + ab * nc + bc * na + ca * nb)
+    return float(angles.sum() / (4 * np.pi))
+
+
 def _normals(mesh: Any) -> NDArray[np.float64]:
     """By the order of the vertices: those of trimesh may come from the file."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
@@ -181,9 +213,7 @@ def _turn_out(path: Path, mesh: Any) -> list[str]:
                 f'{path} has no inside and outside: triangles that share an edge cannot be turned '
                 'alike, it crosses itself or is one-sided; make it anew as the border of a solid'
             )
-    shells = mesh.split(only_watertight=False)
-    if mesh.volume < 0 or any(shell.volume < 0 for shell in shells):
-        repair.fix_inversion(mesh, multibody=len(shells) > 1)
+    _turn_shells(mesh)
     turned = int((np.einsum('ij,ij->i', before, _normals(mesh)) < 0).sum())
     if turned:
         whole = ', the whole surface' if turned == len(mesh.faces) else ''

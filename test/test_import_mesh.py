@@ -80,6 +80,27 @@ def test_defect_with_one_answer_is_mended_and_named(
     assert again.volume == pytest.approx(BODY.volume * 1e-9, rel=2e-3)
 
 
+def shells(inner: float, shift: float, *, turn: bool) -> trimesh.Trimesh:
+    """The body and a smaller one, inside it or beside it; the smaller one perhaps turned."""
+    small = BODY.copy()
+    small.apply_scale(inner)
+    small.apply_translation([shift, 0, 0])
+    if turn:
+        small.invert()
+    return trimesh.util.concatenate([BODY, small])
+
+
+@pytest.mark.parametrize('turn', [False, True])
+@pytest.mark.parametrize(('shift', 'sign'), [(0.0, -1), (100.0, 1)])
+def test_inner_shell_is_a_cavity_and_one_beside_it_another_part_however_they_are_turned(
+    tmp_path: Path, turn: bool, shift: float, sign: int
+) -> None:
+    surface = read_surface(saved(tmp_path, shells(0.5, shift, turn=turn)), 'mm')
+    assert surface.parts == 2
+    assert surface.volume == pytest.approx(BODY.volume * 1e-9 * (1 + sign * 0.125), rel=1e-5)
+    assert bool(surface.mended) == (turn == (sign > 0))
+
+
 def klein_bottle() -> trimesh.Trimesh:
     """A closed surface with one side."""
     u, v = np.meshgrid(np.arange(24), np.arange(12), indexing='ij')
