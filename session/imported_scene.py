@@ -11,7 +11,7 @@ HELD = 0.05
 """Share of the nodes that are fixed, the lowest."""
 LEAST_HELD = 6
 TOOL_RADIUS = 0.004
-CUT_LENGTH = 0.03
+CUT_LENGTH = 0.04
 
 _SCENE = """\
 # {source}, imported: {nodes} nodes, {tetrahedra} tetrahedra, edges of about {edge:.2g} mm.
@@ -23,8 +23,8 @@ tissue:
   material:
     preset: liver_elastography
     # Lower than measured, so that the tissue opens before it has yielded by centimetres.
-    toughness: 30
-    blade_friction: 5
+    toughness: 10
+    blade_friction: 2
   damping: {{alpha: 15, beta: 1.0e-4}}
   # What does not move: the underside. Give boxes instead to hold it elsewhere.
   fixed:
@@ -120,14 +120,14 @@ def scene_text(
             'cut, is the unit right (--unit)?'
         )
     x, y, top = nodes[nodes[:, 2].argmax()]
-    ends, heights = _line(nodes, tetrahedra, np.array([x, y]), min(CUT_LENGTH, size[0] / 3))
+    ends, heights = _line(nodes, tetrahedra, np.array([x, y]), min(CUT_LENGTH, size[0] / 2))
 
     def at(place: float, above: float) -> str:
         height = np.interp(place, ends, heights)
         return f'[{place:.5g}, {y:.5g}, {height + above:.5g}]'
 
     low, high, middle = ends[0], ends[-1], float(ends.mean())
-    press = 1.5 * radius
+    press = radius
     free = max(heights) - min(heights) + 4 * radius
     return _SCENE.format(
         mesh=mesh,
@@ -136,7 +136,7 @@ def scene_text(
         tetrahedra=len(tetrahedra),
         edge=1e3 * edge,
         held=_held(nodes, edge),
-        threshold=0.3 * radius / TOOL_RADIUS,
+        threshold=0.15 * radius / TOOL_RADIUS,
         press=press,
         contact=2 * radius,
         radius=radius,
@@ -149,13 +149,13 @@ def scene_text(
         near=at(x, 3 * radius),
         pressed=at(x, radius - press),
         over=at(low, free),
-        pushed_in=at(low, -2.5 * radius),
-        first=at(low, -0.5 * radius),
-        middle=at(middle, -0.5 * radius),
-        last=at(high, -0.5 * radius),
+        pushed_in=at(low, -3.5 * radius),
+        first=at(low, -1.5 * radius),
+        middle=at(middle, -1.5 * radius),
+        last=at(high, -1.5 * radius),
         out=at(high, 4 * radius),
         end=at(high, 8 * radius),
-        deep=1.5e3 * radius,
+        deep=2.5e3 * radius,
     )
 
 
@@ -175,7 +175,7 @@ def _line(
         [height(nodes, tetrahedra, centre + np.array([offset, 0.0])) for offset in places], float
     )
     # the part around the centre that has tissue under it, and not much lower
-    good = heights > heights[6] - length / 3
+    good = heights > heights[6] - length / 5
     first = 6 - int(np.argmin([*good[6::-1], False]) - 1)
     last = 6 + int(np.argmin([*good[6:], False]) - 1)
     return centre[0] + places[first : last + 1], heights[first : last + 1]
