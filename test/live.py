@@ -25,16 +25,20 @@ from bags.reader import Recorded, open_bag
 from haptic_bridge.settings import DeviceSettings, HapticsSettings
 from haptic_bridge.wire import ForceSampleCodec, WrenchStampedCodec
 from session.domain import reserved_domain
-from session.graph import MODULES
+from session.graph import MODULES, VIEWER_NODE
 from tissue_sim.ros import NEWEST_BEST_EFFORT, polled, take_raw
 
 ROOT = Path(__file__).parents[1]
+NODES = tuple(name for name in MODULES if name != VIEWER_NODE)
+"""Of a session that nobody watches."""
 PATIENCE = 60.0
 SERVO_CF, MEASURED_CF, MEASURED_CP = '/arm/servo_cf', '/arm/measured_cf', '/arm/measured_cp'
 CONTACT, TISSUE_FORCE = '/tool/contact', '/tissue/force'
 ABOVE, PRESSED, EASED = 0.0190, 0.0110, 0.0125
 """Heights of the tip [m] over the block, of which the surface is at 10 mm and the radius 4 mm."""
 SPOT = (-0.012, -0.008)
+PRESSING = 0.18
+"""[N] that says that the hand is down; at rest there it feels a little more."""
 HAPTICS = HapticsSettings()
 PROFILE = DeviceSettings().load_profile()
 FRAME = 1 / 30

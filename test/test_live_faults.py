@@ -23,7 +23,9 @@ from live import (
     HAPTICS,
     MEASURED_CF,
     MEASURED_CP,
+    NODES,
     PATIENCE,
+    PRESSING,
     ROOT,
     SERVO_CF,
     TISSUE_FORCE,
@@ -45,14 +47,12 @@ from bags.reader import Recorded, open_bag
 from bags.repair import repair_bag
 from haptic_bridge.node import FOLLOW_PERIOD
 from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
-from session.graph import MODULES, node_environment
+from session.graph import node_environment
 from session.status import Status
 
 pytestmark = pytest.mark.real_time
 
 SECONDS = 7.0
-PRESSING = 0.25
-"""[N] that says that the hand is down; at rest there it feels a little more."""
 TISSUE_DEADLINE, BRIDGE_DEADLINE = 0.150, 0.030
 FROZEN = 0.8
 UNWRITTEN = 0.5
@@ -110,14 +110,14 @@ def kill(session: LiveSession) -> Kill:
     def kill_and_record(
         node: str, folder: Path = session.bag, then: Callable[[], None] = lambda: None
     ) -> Fault:
-        for name in MODULES:
+        for name in NODES:
             session.wait_until_said(f'{name} is ready')
         session.wait_until_pressed(PRESSING)
         lived = session.running()
         killed = session.kill(node)
         wait_for(lambda: deaths(session.said), f'the launcher to say that {node} died')
         assert session.running() == {n: p for n, p in lived.items() if n != node}
-        assert set(lived) == {*MODULES, 'launcher'}
+        assert set(lived) == {*NODES, 'launcher'}
         assert session.end() == Status.NODE_DIED
         assert deaths(session.said) == [node]
         then()

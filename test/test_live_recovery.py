@@ -9,7 +9,9 @@ from contextlib import contextmanager
 import pytest
 from live import (
     ABOVE,
+    NODES,
     PRESSED,
+    PRESSING,
     ROOT,
     SERVO_CF,
     SPOT,
@@ -23,14 +25,12 @@ from live import (
     write_scene,
 )
 
-from session.graph import MODULES, node_environment
+from session.graph import node_environment
 
 pytestmark = pytest.mark.real_time
 
 SECONDS = 200.0
 """Longer than it takes, even on a busy machine: the test interrupts the session."""
-PRESSING = 0.25
-"""[N] that says that the hand is down."""
 KILLED = ('tissue_sim', 'haptic_bridge')
 
 
@@ -62,7 +62,7 @@ def played(
     script = [phase('approach', (*SPOT, ABOVE, 1.0), share=1.0), down]
     session = LiveSession(folder, write_scene(folder, script, SECONDS, 100.0), free_domain())
     try:
-        for name in MODULES:
+        for name in NODES:
             session.wait_until_said(f'{name} is ready')
         session.wait_until_pressed(PRESSING)
         with (

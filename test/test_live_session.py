@@ -11,6 +11,8 @@ from bag_copies import moved_by, rewritten
 from live import (
     CONTACT,
     MEASURED_CP,
+    NODES,
+    PRESSING,
     SERVO_CF,
     SPOT,
     TISSUE_FORCE,
@@ -36,7 +38,6 @@ from haptic_bridge.wire import (
     PoseStampedCodec,
     WrenchStampedCodec,
 )
-from session.graph import MODULES
 from session.recorded_scene import restore_scene
 from session.resimulate import pose_check, recomputation
 from session.scene import load_scene
@@ -202,7 +203,7 @@ MOMENTS = {
         lambda: len(session.running()) > 1, 'a node'
     ),
     'while the nodes start': lambda session: session.wait_until_said('recorder is ready'),
-    'in contact': lambda session: session.wait_until_pressed(0.25),
+    'in contact': lambda session: session.wait_until_pressed(PRESSING),
 }
 
 
@@ -241,12 +242,12 @@ def test_interrupt_ends_every_process_and_closes_the_bag(
     assert_nothing_left(interrupted)
     if moment == 'in contact':
         assert Recording(interrupted.bag).complete
-        assert set(MODULES) == {path.stem for path in (interrupted.bag / 'log').iterdir()}
+        assert set(NODES) == {path.stem for path in (interrupted.bag / 'log').iterdir()}
 
 
 @pytest.mark.parametrize('pause', [0.0, 0.3])
 def test_second_interrupt_leaves_nothing_either(interrupted: LiveSession, pause: float) -> None:
-    interrupted.wait_until_pressed(0.25)
+    interrupted.wait_until_pressed(PRESSING)
     interrupted.interrupt()
     time.sleep(pause)
     interrupted.interrupt()
@@ -257,7 +258,7 @@ def test_second_interrupt_leaves_nothing_either(interrupted: LiveSession, pause:
 def test_interrupt_while_the_bag_is_read_at_the_end_is_an_interrupt_as_any(
     interrupted: LiveSession,
 ) -> None:
-    interrupted.wait_until_pressed(0.25)
+    interrupted.wait_until_pressed(PRESSING)
     interrupted.interrupt()
     wait_for(lambda: list(interrupted.running()) == ['launcher'], 'the nodes to end')
     interrupted.interrupt()
