@@ -48,11 +48,11 @@ def make_simulation(settings: TissueSettings) -> tuple[TissueSimulation, Plan | 
     Raises:
         MeshError: the mesh cannot be used.
     """
+    # First of all: of a kernel that several others contain, a process runs the copy that it loaded
+    # first, and copies may differ in the last bit. Loaded in one order, they are always the same.
+    warm_up()
     task = make_task(settings)
-    found = None
-    if settings.method == 'auto':
-        warm_up()  # a kernel that is compiled meanwhile would count as cost
-        found = plan(task)
+    found = plan(task) if settings.method == 'auto' else None
     model, stepping = settings.model, task.stepping
     active = ActiveSettings(**settings.active_region.model_dump())
     if found is not None and found.chosen is not None:

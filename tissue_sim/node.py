@@ -22,7 +22,6 @@ from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
 from tissue_sim.timing import PeriodicLoop
 from tissue_sim.tool_contact import tool_contact
-from tissue_sim.warm_up import warm_up
 
 _CONTACT_AGE_NS = 100_000_000
 _KEYFRAME_SECONDS = 5.0
@@ -77,7 +76,6 @@ class TissueSimNode(Node):
 
     def work(self, stop: ros.Stop) -> None:
         """Runs frames to the end."""
-        warm_up()
         with self._lock:
             self._publish_keyframe()
         ros.announce_ready(self)

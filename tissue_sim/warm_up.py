@@ -1,5 +1,6 @@
 """Calls every kernel of the tissue once, so that none is compiled or loaded in a session."""
 
+from functools import cache
 from itertools import permutations
 
 import numpy as np
@@ -19,8 +20,12 @@ from tissue_sim.simulation import TissueSimulation
 _FRAMES = 40
 
 
+@cache
 def warm_up() -> None:
-    """Every model and integrator; a tool on a cube until the blade is through; an element out."""
+    """Every model and integrator; a tool on a cube until the blade is through; an element out.
+
+    Only the first call does anything.
+    """
     _warm_up_models()
     simulation = TissueSimulation(
         small_cube(), Material(1000.0, 0.4, 1000.0, 10.0, 5e-4), Resistance(0.05, 1.0, 0.1)
