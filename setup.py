@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 ROOT = Path(__file__).parent
+PACKAGES = ('tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'viewer', 'session')
 
 
 def at_least(name: str) -> list[str]:
@@ -19,7 +20,7 @@ setup(
     description='Teleoperated soft-tissue cutting trainer for ROS 2',
     license='Apache-2.0',
     python_requires='>=3.11,<3.14',
-    packages=['tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'viewer', 'session'],
+    packages=find_packages(str(ROOT), include=[f'{name}*' for name in PACKAGES]),
     install_requires=at_least('requirements.txt'),
     extras_require={'mesh': at_least('requirements-mesh.txt')},
     entry_points={'console_scripts': ['cutting-trainer = session.cli:main']},

@@ -3,11 +3,12 @@
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 
-from bags.frames import FrameRecord, read_frames
+from bags.frames import FrameRecord, Restart, read_first_run, runs
 from bags.reader import Bag
 from bags.resimulation import Recomputation
 from bags.topics import MESH, UPDATES
@@ -37,6 +38,10 @@ class _Differs(Exception):  # noqa: N818
         self.size = float(size)
 
 
+class _Lacks(_Differs):
+    """A frame cannot be computed from what the bag has."""
+
+
 @dataclass(frozen=True)
 class Difference:
     """Where what is computed first differs from what was recorded.
@@ -46,12 +51,14 @@ class Difference:
         seconds: its time since the first frame [s].
         what: one sentence.
         size: of it, in relation to what was recorded; infinite where it is not one of numbers.
+        lacks: it was not computed, because the bag lost what it would be computed from.
     """
 
     step: int
     seconds: float
     what: str
     size: float = np.inf
+    lacks: bool = False
 
 
 @dataclass
@@ -64,6 +71,8 @@ class Comparison:
         forces, meshes, hashes, poses: compared.
         missing: what the bag lacks, in number, by a phrase.
         difference: the first, None when all that was compared is identical.
+        restart: where another process went on, from a state that the bag does not have (velocities,
+            what the method of cutting remembered): it ends there. None: nowhere.
     """
 
     frames: int = 0
@@ -74,6 +83,7 @@ class Comparison:
     poses: int = 0
     missing: Counter[str] = field(default_factory=Counter)
     difference: Difference | None = None
+    restart: Restart | None = None
 
 
 class RecordedMesh:
@@ -126,10 +136,11 @@ class RecordedMesh:
 
 
 class _Ahead:
-    """Messages of one topic with a step, read one ahead."""
+    """Messages of one topic with a step, read one ahead, up to a restart of their publisher."""
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        self._source: Iterator[Any] = (bag.read(recorded) for recorded in bag.messages([topic]))
+        first = takewhile(lambda of: of[0] == 0, runs(bag, topic))
+        self._source: Iterator[Any] = (message for _, message in first)
         self._next = next(self._source, None)
 
     @property
@@ -149,7 +160,7 @@ def compare(
     pose_error: PoseError,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Comparison:
-    """Computes the frames of a bag from their recorded inputs, until one differs.
+    """Computes the frames of a bag from their recorded inputs, until one differs or a restart.
 
     Args:
         bag: to read.
@@ -157,9 +168,9 @@ def compare(
         pose_error: how far the tool of a contact is from where its pose puts it.
         progress: told how many frames are done, and how many there are.
     """
-    comparison = Comparison()
     recorded = RecordedMesh(bag)
-    records = read_frames(bag)
+    records, restart = read_first_run(bag)
+    comparison = Comparison(restart=restart)
     for i, record in enumerate(records):
         comparison.seconds = (record.time - records[0].time) * 1e-9
         try:
@@ -167,7 +178,11 @@ def compare(
             _check_frame(record, computed, recorded, comparison)
         except _Differs as differs:
             comparison.difference = Difference(
-                record.step, comparison.seconds, str(differs), differs.size
+                record.step,
+                comparison.seconds,
+                str(differs),
+                differs.size,
+                isinstance(differs, _Lacks),
             )
             break
         comparison.frames += 1
@@ -182,9 +197,9 @@ def _check_record(
     record: FrameRecord, step: int, comparison: Comparison, pose_error: PoseError
 ) -> None:
     if record.step != step:
-        raise _Differs(f'the bag lacks frame {step}: nothing after it can be computed')
+        raise _Lacks(f'the bag lacks frame {step}: nothing after it can be computed')
     if record.has_contact and record.contact is None:
-        raise _Differs('the bag lacks the contact that loaded this frame: it cannot be computed')
+        raise _Lacks('the bag lacks the contact that loaded this frame: it cannot be computed')
     if record.has_contact and record.pose is None:
         comparison.missing['poses of the device'] += 1
     elif record.pose is not None:

@@ -1,7 +1,7 @@
 """What a bag says of each simulation frame: its inputs and the force that came of it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +11,7 @@ from bags.errors import BagError
 from bags.reader import Bag
 from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, of_session
 from haptic_bridge.wire import ContactCodec, ForceSampleCodec, PoseStampedCodec, Sample
+from tissue_sim.stamps import nanoseconds
 
 NO_ANSWER, APPLIED, EMPTY, REFUSED, LOST, GIVEN_UP = range(6)
 """The numbers of `FrameInputs.answer`."""
@@ -41,19 +42,59 @@ class FrameRecord:
     force: Sample | None
 
 
+@dataclass(frozen=True)
+class Restart:
+    """Where another process went on with the simulation.
+
+    Attributes:
+        step: its first frame.
+        seconds: when that was [s] since the first frame of all.
+    """
+
+    step: int
+    seconds: float
+
+
+def runs(bag: Bag, topic: str) -> Iterator[tuple[int, Any]]:
+    """The messages of a topic of `tissue_sim`, with how often it had been started again before.
+
+    A new process numbers its messages anew; it goes on with the frames as the tissue was known,
+    from one that there was already or from the next.
+    """
+    run = number = step = -1
+    for recorded in bag.messages([topic]):
+        message = bag.read(recorded)
+        if message.step < step or 0 < recorded.sequence <= number or run < 0:
+            run += 1
+        number, step = recorded.sequence, message.step
+        yield run, message
+
+
 def read_frames(bag: Bag) -> list[FrameRecord]:
-    """The frames of a bag in their order, up to where the simulation was started anew.
+    """The frames of a bag in their order, up to where the simulation was started again.
+
+    Raises:
+        BagError: the bag does not say what its frames were computed from.
+    """
+    return read_first_run(bag)[0]
+
+
+def read_first_run(bag: Bag) -> tuple[list[FrameRecord], Restart | None]:
+    """As `read_frames`, and where the simulation was started again; None: nowhere.
 
     Raises:
         BagError: the bag does not say what its frames were computed from.
     """
     if INPUTS not in bag.topics():
         raise BagError(f'{bag.path} has no topic {INPUTS}: it is older than format version 2')
-    inputs = [bag.read(recorded) for recorded in bag.messages([INPUTS])]
-    for i, (before, after) in enumerate(pairwise(inputs)):
-        if after.step <= before.step:
-            del inputs[i + 1 :]
+    inputs: list[Any] = []
+    restart = None
+    for run, m in runs(bag, INPUTS):
+        if run or (inputs and m.step == inputs[-1].step):
+            late = nanoseconds(m.header.stamp) - nanoseconds(inputs[0].header.stamp)
+            restart = Restart(m.step, late * 1e-9)
             break
+        inputs.append(m)
     used = {(m.contact_sequence, nanoseconds(m.contact_stamp)) for m in inputs if m.has_contact}
     contacts = _samples(bag, CONTACT, ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used)
     pose, wanted = of_session(POSE, bag.topics()), {stamp for _, stamp in used}
@@ -76,12 +117,7 @@ def read_frames(bag: Bag) -> list[FrameRecord]:
                 force=forces.get(time),
             )
         )
-    return records
-
-
-def nanoseconds(stamp: Any) -> int:
-    """A time stamp in a message [ns]."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return records, restart
 
 
 def contact_message(sample: Sample) -> Any:

@@ -1,5 +1,7 @@
 """Node `recorder`: every topic of the graph, as it comes, into a bag."""
 
+import itertools
+import json
 import platform
 import time
 from collections.abc import Callable
@@ -11,7 +13,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from bags.errors import BagError
@@ -22,7 +23,9 @@ from bags.parameters import ParameterCollector
 from bags.qos import OfferedQos
 from bags.sequences import SequenceCounter
 from bags.writer import BagWriter
+from tissue_sim.lifecycle import ManagedNode, Stop, announce_ready, run
 from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
+from tissue_sim.refusals import MessageError
 from tissue_sim.ros import (
     ARM,
     CONTACT,
@@ -37,10 +40,7 @@ from tissue_sim.ros import (
     STREAM,
     UPDATES,
     Diagnostics,
-    Stop,
-    announce_ready,
     polled,
-    run,
 )
 from tissue_sim.share import share_folder
 
@@ -103,31 +103,80 @@ class _Stream:
         self.counter = SequenceCounter(count_publishers)
 
 
-class Recorder(Node):
+class Recorder(ManagedNode):
     """Subscribes to whatever the graph has and writes it to the bag named by the parameter `bag`.
+
+    It judges no message but by its size: malformed ones are recorded as they came, byte for byte,
+    since a bag is where one looks for them. Its refusals count what is larger than `max_message`.
 
     Parameters:
         bag: folder of the new bag.
         scene: scene file, of which the text goes into the bag; none when empty.
         seed: of the session; goes into the bag.
+        account_as_json: say at the end in lines for the launcher what became of all messages.
+        max_message: bytes of a message that is recorded, of meshes too.
     """
+
+    largest_message = 1 << 26
 
     def __init__(self) -> None:
         super().__init__('recorder')
+        self._configured = False
+
+    def configure(self) -> None:
+        """Begins the bag."""
         folder = str(parameter(self, 'bag', '', 'new folder for the bag'))
         if not folder:
             raise BagError('the parameter "bag" is missing: name the folder of the new bag')
         scene, seed = scene_parameter(self), seed_parameter(self)
-        self.writer = BagWriter(Path(folder), custom_data=_custom_data(scene, seed))
+        text = 'say at the end in lines of JSON what became of all messages'
+        self._as_json = bool(parameter(self, 'account_as_json', False, text))
+        self.writer = BagWriter(self._folder(Path(folder)), custom_data=_custom_data(scene, seed))
         self._streams: dict[str, _Stream] = {}
         self._unrecorded: dict[str, str] = {}
         self._drawings = self.resolve_topic_name(MARKERS)
-        self._closed = False
         self._collector = ParameterCollector(self)
         self._depths = {
             self.resolve_topic_name(name): profile.depth for name, profile in _CONFIGURED.items()
         }
         self._diagnostics = Diagnostics(self, self._collect)
+
+    def _folder(self, asked: Path) -> Path:
+        """The folder that was asked for; or, where it is taken, one named after it."""
+        again, self._configured = self._configured, True
+        text = 'the bag was begun by a recorder that died: begin one beside it'
+        if not (parameter(self, 'resume', False, text) or again):
+            return asked
+        later = (asked.with_name(f'{asked.name}-{count}') for count in itertools.count(2))
+        return next(folder for folder in itertools.chain([asked], later) if not folder.exists())
+
+    def work(self, stop: Stop) -> None:
+        """Records until `stop` is set."""
+        self._forget()
+        self.discover()
+        announce_ready(self)
+        periods = {self.discover: _DISCOVER, self.review: _REVIEW, self.flush: _FLUSH}
+        due = dict.fromkeys(periods, 0.0)
+        while not stop.is_set():
+            time.sleep(_POLL)
+            self.drain()
+            now = time.monotonic()
+            for act, period in periods.items():
+                if now >= due[act]:
+                    due[act] = now + period
+                    act()
+
+    def rest(self) -> None:
+        """Records what has come, and lets pass what comes from now on."""
+        self.drain()
+        self.flush()
+
+    def _forget(self) -> None:
+        """Lets go of what came while the node was inactive: it is neither recorded nor lost."""
+        for stream in self._streams.values():
+            while stream.take(stream.message_type, True) is not None:
+                pass
+            stream.counter.pause()
 
     def discover(self) -> None:
         """Subscribes to topics that have got their first publisher since the last time."""
@@ -164,6 +213,11 @@ class Recorder(Node):
         for stream in list(self._streams.values()):
             while (taken := stream.take(stream.message_type, True)) is not None:
                 data, info = taken
+                if len(data) > self.max_message:
+                    text = f'{len(data)} bytes: {self.max_message} at most (parameter max_message)'
+                    self.refusals.add(stream.topic, MessageError('too large', text))
+                    stream.counter.add(info['publication_sequence_number'])
+                    continue
                 number = info['publication_sequence_number']
                 stream.counter.add(number)
                 received = info['received_timestamp'] or time.time_ns()
@@ -172,16 +226,30 @@ class Recorder(Node):
         for received, topic, published, data, number in batch:
             self.writer.write(topic, received, published, data, number or 0)
 
-    def close(self) -> None:
+    def release(self) -> None:
         """Takes the last messages, completes the bag and says what became of all."""
-        if self._closed:
-            return
-        self._closed = True
-        self.drain()
         self.writer.describe(parameters=self._collector.text)
         self.writer.close()
-        accounts = self.accounts()
+        self._say(self.accounts())
+        if self.writer.failure:
+            lost = sum(self.writer.lost.values())
+            text = f'{self.writer.failure}: {lost} messages are not in the bag'
+            print(f'failed: {self.get_name()}: {text}', flush=True)
+
+    def _say(self, accounts: dict[str, Account]) -> None:
+        """What became of all messages, for the user or for the launcher."""
         tally = self.writer.tally
+        if self._as_json:
+            told = {
+                'bag': str(self.writer.folder),
+                'bytes': self.writer.size,
+                'failure': self.writer.failure,
+                'not_recorded': self._unrecorded,
+            }
+            print(f'message: {json.dumps(told)}', flush=True)
+            for topic, account in accounts.items():  # one by one: lines have a greatest length
+                print(f'message: {json.dumps({topic: asdict(account)})}', flush=True)
+            return
         print(
             f'recorded: {tally.messages} messages, {len(tally.counts)} topics, '
             f'{sum(account.lost for account in accounts.values())} lost, {self.writer.folder}',
@@ -191,10 +259,6 @@ class Recorder(Node):
             print(f'  {topic}: {account.sentence}', flush=True)
         for topic, reason in self._unrecorded.items():
             print(f'  not recorded: {topic}: {reason}', flush=True)
-        if self.writer.failure:
-            lost = sum(self.writer.lost.values())
-            text = f'{self.writer.failure}: {lost} messages are not in the bag'
-            print(f'failed: {self.get_name()}: {text}', flush=True)
 
     def accounts(self) -> dict[str, Account]:
         """What became of the messages of each topic so far."""
@@ -206,7 +270,7 @@ class Recorder(Node):
                 lost=stream.counter.lost + refused.get(topic, 0),
                 unheard=stream.counter.before,
             )
-            for topic, stream in self._streams.items()
+            for topic, stream in self._streams.copy().items()  # the loop may find another one
         }
 
     def _start(self, topic: str, type_name: str) -> None:
@@ -241,7 +305,8 @@ class Recorder(Node):
         values: dict[str, object] = {**totals, 'bytes': self.writer.size}
         for topic, account in accounts.items():
             values |= {f'{word} {topic}': count for word, count in asdict(account).items()}
-        values |= {f'not recorded {topic}': reason for topic, reason in self._unrecorded.items()}
+        unrecorded = self._unrecorded.copy().items()
+        values |= {f'not recorded {topic}': reason for topic, reason in unrecorded}
         if self.writer.failure:
             return DiagnosticStatus.ERROR, self.writer.failure, values
         if totals['lost'] or self._unrecorded:
@@ -249,25 +314,9 @@ class Recorder(Node):
         return DiagnosticStatus.OK, 'recording', values
 
 
-def record(node: Recorder, stop: Stop) -> None:
-    """Records until `stop` is set."""
-    node.discover()
-    announce_ready(node)
-    periods = {node.discover: _DISCOVER, node.review: _REVIEW, node.flush: _FLUSH}
-    due = dict.fromkeys(periods, 0.0)
-    while not stop.is_set():
-        time.sleep(_POLL)
-        node.drain()
-        now = time.monotonic()
-        for act, period in periods.items():
-            if now >= due[act]:
-                due[act] = now + period
-                act()
-
-
 def main() -> None:
     """Runs the node; exit status 1 where the disk has refused messages."""
-    recorder = run(Recorder, record)
+    recorder = run(Recorder)
     raise SystemExit(1 if recorder.writer.failure else 0)
 
 

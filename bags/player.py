@@ -9,7 +9,7 @@ import numpy as np
 
 from bags.errors import BagError
 from bags.reader import Bag, Recorded
-from bags.topics import MESH, POSE, UPDATES, of_session
+from bags.topics import BUTTON, MESH, POSE, UPDATES, of_session
 from haptic_bridge.wire import PoseStampedCodec, Sample
 
 STEP = 1 / 30
@@ -58,6 +58,10 @@ class Playhead:
             self.rounds += self._loop
             self._position = self._start if self._loop else self._end
         return self._position
+
+    def go(self) -> None:
+        """Goes on."""
+        self.paused = False
 
     def toggle(self) -> None:
         """Pauses, or goes on."""
@@ -162,7 +166,7 @@ class RecordedStream:
 
 
 class RecordedHand:
-    """The way of the device.
+    """The way of the device, and its button.
 
     Args:
         bag: to read.
@@ -178,11 +182,27 @@ class RecordedHand:
             raise BagError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
         self._times = np.array([(m.log_time - origin) * 1e-9 for m in recorded])
         self._poses = [codec.decode(m.data) for m in recorded]
+        events = list(bag.messages([of_session(BUTTON, bag.topics())]))
+        self._event_times = np.array([(m.log_time - origin) * 1e-9 for m in events])
+        self._events = [m.data for m in events]
 
     def pose(self, position: float) -> Sample:
         """The newest pose at a position [s], the first one before it."""
         at = int(np.searchsorted(self._times, position, 'right')) - 1
         return self._poses[max(at, 0)]
+
+    def events(self, before: int, position: float) -> tuple[list[bytes], int]:
+        """What the button did on the way to a position.
+
+        Args:
+            before: number of events that are done; after a way back only the last one counts.
+            position: [s].
+
+        Returns:
+            The messages as they were recorded, and the number of events done by then.
+        """
+        done = int(np.searchsorted(self._event_times, position, 'right'))
+        return self._events[before if done >= before else max(done - 1, 0) : done], done
 
     @property
     def span(self) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """The ROS side of a replay: publishes what `bags.player` gives, and watches for live input."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection
@@ -10,21 +11,24 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Joy
 
 from bags.message_class import message_class
 from bags.player import Playhead, RecordedHand, RecordedStream
 from bags.qos import OfferedQos
 from bags.reader import Bag
-from bags.topics import OF_DEVICE, OF_TISSUE, POSE, REPLAYED, SERVO_CF
+from bags.topics import BUTTON, OF_DEVICE, OF_TISSUE, POSE, REPLAYED, SERVO_CF
 from haptic_bridge.operating_state import State, crtk_types
 from haptic_bridge.wire import PoseStampedCodec, WrenchStampedCodec
-from tissue_sim.ros import LATCHED, STREAM
+from tissue_sim.ros import EVENTS, LATCHED, STREAM
 from tissue_sim.timing import PeriodicLoop
 
 _RATE = 1000.0
 _DISCOVERY = 1.5
 """[s] in which publishers that are there are seen."""
 _WATCH = 0.5
+_ENABLING = {False: 30.0, True: 5.0}
+"""[s] that the haptic bridge has to be enabled; in a FAULT, that it has to get out of it."""
 
 
 def publisher_qos(profiles: list[OfferedQos]) -> QoSProfile:
@@ -98,6 +102,9 @@ class Player(Node):
     def finish(self) -> None:
         """Publishes what must not be left out at the end."""
 
+    def watch(self, now: float) -> None:
+        """Is called now and then, with the time [s] of `time.monotonic`."""
+
     def _look(self, topics: Collection[str], own: int) -> None:
         for topic in topics:
             publishers = self.get_publishers_info_by_topic(topic)
@@ -123,11 +130,16 @@ class Player(Node):
 
     def _serve(self) -> None:
         due = 0.0
-        while not self._stop.is_set():
-            self._executor.spin_once(timeout_sec=0.05)
-            if time.monotonic() >= due:
-                due = time.monotonic() + _WATCH
-                self._look(self._watched, 1)
+        try:
+            while not self._stop.is_set():
+                self._executor.spin_once(timeout_sec=0.05)
+                if (now := time.monotonic()) >= due:
+                    due = now + _WATCH
+                    self._look(self._watched, 1)
+                    self.watch(now)
+        except Exception as error:  # deaf, the replay would wait for ever
+            if not self._stop.is_set():
+                self.refusal = f'the replay cannot listen to the graph any more: {error}'
 
 
 class SessionPlayer(Player):
@@ -146,7 +158,7 @@ class SessionPlayer(Player):
     ) -> None:
         super().__init__(context, playhead)
         self._bag, self._start = bag, start
-        wanted = (*OF_TISSUE, SERVO_CF) if drive_device else (*OF_TISSUE, *OF_DEVICE)
+        wanted = (*OF_TISSUE, SERVO_CF) if drive_device else (*OF_TISSUE, *OF_DEVICE, BUTTON)
         self.topics = [topic for topic in wanted if topic in bag.topics()]
         self._wrench = WrenchStampedCodec('arm_base')
         self._stream = RecordedStream(bag, self.topics, start)
@@ -186,8 +198,9 @@ class SessionPlayer(Player):
 class HandPlayer(Player):
     """Is the device of a session: publishes its recorded poses anew, a thousand times a second.
 
-    It waits at the first pose until the haptic bridge is enabled; a pause holds the hand still.
-    When the bridge comes to a FAULT the hand stays where it is.
+    Its button does what it did, when it did. The hand waits at the first pose until the haptic
+    bridge is enabled; a pause holds it still. When the bridge comes to a FAULT, or never gets out
+    of one, the hand stays where it is.
 
     Args:
         context: of the domain to play into.
@@ -199,12 +212,15 @@ class HandPlayer(Player):
         super().__init__(context, playhead)
         self._hand = hand
         self._codec = PoseStampedCodec(hand.pose(0.0).frame_id)
-        self._enabled = False
+        self._begun = False
+        self._state, self._since = '', math.inf
+        self._events = 0
 
     def advertise(self) -> None:
-        """Makes the publisher."""
+        """Makes the publishers."""
         self._poses = self.create_publisher(PoseStamped, f'{REPLAYED}{POSE}', STREAM)
-        self._watched = [f'{REPLAYED}{POSE}']
+        self._button = self.create_publisher(Joy, f'{REPLAYED}{BUTTON}', EVENTS)
+        self._watched = [f'{REPLAYED}{POSE}', f'{REPLAYED}{BUTTON}']
         self.create_subscription(
             crtk_types().operating_state, '/haptic_bridge/operating_state', self._heard, LATCHED
         )
@@ -212,10 +228,29 @@ class HandPlayer(Player):
     def play(self, position: float) -> None:
         values = self._hand.pose(position).values
         self._poses.publish(self._codec.encode(time.time_ns(), values))
+        events, done = self._hand.events(self._events, position)
+        # Before the bridge is enabled an event would be lost on a bridge that does not listen yet.
+        if done != self._events and (self._begun or self._button.get_subscription_count()):
+            self._events = done
+            for data in events:
+                self._button.publish(data)
+
+    def watch(self, now: float) -> None:
+        """Gives up a bridge that is not enabled: it may have been so, too shortly to be heard."""
+        if self._since == math.inf:
+            self._since = now
+        if not self._begun and now - self._since > _ENABLING[self._state == State.FAULT]:
+            if self._state == State.FAULT:
+                self.faulted = self.playhead.position
+            else:
+                said = self._state or 'nothing about its state'
+                self.refusal = f'the haptic bridge was not enabled within 30 s, it says {said}'
 
     def _heard(self, message: Any) -> None:
-        if not self._enabled and message.state == State.ENABLED:
-            self._enabled = True
-            self.playhead.toggle()
-        elif self._enabled and self.faulted is None and message.state == State.FAULT:
+        if message.state != self._state:
+            self._state, self._since = message.state, time.monotonic()
+        if not self._begun and message.state in (State.ENABLED, State.PAUSED):
+            self._begun = True
+            self.playhead.go()
+        elif self._begun and self.faulted is None and message.state == State.FAULT:
             self.faulted = self.playhead.position

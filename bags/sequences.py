@@ -21,7 +21,8 @@ class SequenceCounter:
         publishers: how many the topic is known to have had at once.
         received: messages that came.
         lost: messages missing between two that came.
-        before: messages that publishers had sent before the first that came of theirs.
+        before: messages that publishers had sent before the first that came of theirs, or while
+            nobody listened.
     """
 
     def __init__(self, count_publishers: Callable[[], int] = lambda: 1) -> None:
@@ -31,6 +32,11 @@ class SequenceCounter:
         self.lost = 0
         self.before = 0
         self._next: list[int] = []
+        self._excused: set[int] = set()
+
+    def pause(self) -> None:
+        """What is sent from now on to the next message that comes was not to be heard."""
+        self._excused = set(self._next)
 
     def add(self, number: int | None) -> None:
         """Takes a message by its number.
@@ -54,5 +60,9 @@ class SequenceCounter:
             self._next.append(number + 1)
         else:
             nearest = max(below)
-            self.lost += number - nearest
+            if nearest in self._excused:
+                self.before += number - nearest
+                self._excused.discard(nearest)
+            else:
+                self.lost += number - nearest
             self._next[self._next.index(nearest)] = number + 1

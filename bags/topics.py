@@ -7,6 +7,7 @@ FORCE, INPUTS = '/tissue/force', '/tissue/frame_inputs'
 CONTACT = '/tool/contact'
 POSE, SERVO_CF = '/arm/measured_cp', '/arm/servo_cf'
 OF_DEVICE = (POSE, '/arm/measured_cv', '/arm/measured_cf')
+BUTTON = '/arm/button'
 OF_TISSUE = (MESH, UPDATES, FORCE, CONTACT)
 CUTS = '/cutting/cut/_service_event'
 DIAGNOSTICS = '/diagnostics'

@@ -61,9 +61,23 @@ class Page:
                 assert 'error' not in message, message
                 return message['result']
 
+    def resize(self, width: int, height: int) -> None:
+        """Gives the page another size [pixel]."""
+        self.call(
+            'Emulation.setDeviceMetricsOverride',
+            width=width,
+            height=height,
+            deviceScaleFactor=1 / self._coarseness,
+            mobile=False,
+        )
+
     def open(self, url: str) -> None:
         """Goes to a page."""
         self.call('Page.navigate', url=url)
+
+    def reload(self) -> None:
+        """Loads the page again, without a copy of the old one in the back."""
+        self.call('Page.reload')
 
     def evaluate(self, script: str) -> Any:
         """The value of an expression in the page."""
@@ -105,15 +119,28 @@ class Page:
 
     def click(self, text: str) -> None:
         """Clicks the button that says this."""
+        self._click('button:enabled', f'e.innerText.trim() === {json.dumps(text)}')
+
+    def choose(self, now: str, wanted: str) -> None:
+        """Chooses something else where a list shows what is chosen now."""
+        self._click('input[role=combobox]:enabled', f'e.value === {json.dumps(now)}')
+        said = f'e.innerText.trim() === {json.dumps(wanted)}'
+        self._click('[role=option]', f'{said} && e.offsetParent')
+
+    def slide(self, share: float) -> None:
+        """Clicks on the first slider, at a share of its length."""
+        self._click('.mantine-Slider-root', 'true', share)
+
+    def _click(self, kind: str, condition: str, share: float = 0.5) -> None:
+        """Clicks on the first element `e` of a kind that fulfils a condition, both as scripts."""
         script = f"""(() => {{
-            const all = [...document.querySelectorAll('button')];
-            const one = all.find(b => b.innerText.trim() === {json.dumps(text)});
+            const one = [...document.querySelectorAll('{kind}')].find(e => {condition});
             if (!one) return null;
             one.scrollIntoView({{block: 'nearest'}});
             const r = one.getBoundingClientRect();
-            return [r.x + r.width / 2, r.y + r.height / 2];
+            return r.width ? [r.x + {share} * r.width, r.y + r.height / 2] : null;
         }})()"""
-        place = self.wait(lambda: self.evaluate(script), f'the button {text}')
+        place = self.wait(lambda: self.evaluate(script), f'{kind} where {condition}')
         self.mouse('mouseMoved', *place)
         self.mouse('mousePressed', *place, pressed=True)
         self.mouse('mouseReleased', *place)
@@ -153,14 +180,7 @@ class Browser:
         request = Request(f'http://127.0.0.1:{self._port}/json/new?about:blank', method='PUT')
         with urlopen(request) as answer:
             page = Page(json.load(answer)['webSocketDebuggerUrl'], self._coarseness)
-        width, height = self._size
-        page.call(
-            'Emulation.setDeviceMetricsOverride',
-            width=width,
-            height=height,
-            deviceScaleFactor=1 / self._coarseness,
-            mobile=False,
-        )
+        page.resize(*self._size)
         page.open(url)
         self.pages.append(page)
         return page
@@ -182,6 +202,7 @@ def chromium(size: tuple[int, int], coarseness: int = 1) -> Iterator[Browser]:
         command += [f'--user-data-dir={profile}', '--no-first-run', '--disable-extensions']
         command += ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--mute-audio']
         command += ['--disable-background-networking', '--disable-dev-shm-usage']
+        command += ['--disable-features=BackForwardCache']
         command += ['--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1']
         with Path(profile, 'said').open('wb') as said:
             process = subprocess.Popen(

@@ -1,7 +1,16 @@
-"""Open pages without a browser: clients that read what the server sends, fast, slowly or never."""
+"""Open pages without a browser: clients that read what the server sends, or never do.
 
+Run `python -m bench.open_page URL [--pages 3]`: says `open` once all have the whole scene, reads
+until its standard input is closed, then prints what came as JSON.
+"""
+
+import argparse
 import importlib.metadata
+import json
+import subprocess
+import sys
 import threading
+import time
 from typing import Any
 
 import msgspec
@@ -22,7 +31,7 @@ class OpenPage:
 
     Attributes:
         windows: messages of the socket that were read.
-        updates: new positions of a mesh among them.
+        updates: those of them with new positions of the tissue.
         newest: the last of those, shape (n, 3).
     """
 
@@ -69,9 +78,56 @@ class OpenPage:
             at += -at % 8
             buffers.append(data[at : at + size])
             at += size
-        for message in content['messages']:
-            vertices = message.get('updates', {}).get('vertices')
-            if vertices is not None:
-                self.updates += 1
-                place = vertices['__binary_index']
-                self.newest = np.frombuffer(buffers[place], np.float32).reshape(-1, 3)
+        found = [message.get('updates', {}).get('vertices') for message in content['messages']]
+        moved = [vertices for vertices in found if vertices is not None]
+        self.updates += bool(moved)  # outer surface and cut surfaces are two meshes of a frame
+        for vertices in moved:
+            place = vertices['__binary_index']
+            self.newest = np.frombuffer(buffers[place], np.float32).reshape(-1, 3)
+
+
+class OtherProcess:
+    """Open pages in a process of their own; they have the whole scene when this is made.
+
+    Args:
+        url: of the page.
+        pages: how many.
+        nice: its niceness; with 19 it takes only what nobody else wants of a core.
+    """
+
+    def __init__(self, url: str, pages: int, nice: int) -> None:
+        command = ['nice', '-n', str(nice), sys.executable, '-m', __spec__.name, url]
+        self._process = subprocess.Popen(
+            [*command, '--pages', str(pages)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == b'open\n'
+
+    def close(self) -> dict[str, Any]:
+        """Ends it; returns `rates` of each page [Hz] and `load`, processor time by time [1]."""
+        said, _ = self._process.communicate()
+        result: dict[str, Any] = json.loads(said)
+        return result
+
+
+def main() -> None:
+    """Reads until the standard input ends."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('url')
+    parser.add_argument('--pages', type=int, default=1)
+    given = parser.parse_args()
+    pages = [OpenPage(given.url) for _ in range(given.pages)]
+    while any(page.newest is None for page in pages):
+        time.sleep(0.05)
+    print('open', flush=True)
+    before, began, busy = [page.updates for page in pages], time.monotonic(), time.process_time()
+    sys.stdin.read()
+    seconds = time.monotonic() - began
+    rates = [(page.updates - count) / seconds for page, count in zip(pages, before, strict=True)]
+    print(json.dumps({'rates': rates, 'load': (time.process_time() - busy) / seconds}))
+
+
+if __name__ == '__main__':
+    main()

@@ -16,7 +16,7 @@ from scipy.spatial import Delaunay
 from bench.reproduction_page import write_page
 from cutting.methods import make_method
 from cutting.settings import CuttingSettings
-from session.stability_report import highest_mode, measured_limit
+from session.measure.stability_report import highest_mode, measured_limit
 from tissue_sim.blade import Resistance, Sweep
 from tissue_sim.budget import Budget
 from tissue_sim.candidate import Task

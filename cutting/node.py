@@ -8,7 +8,6 @@ import numpy as np
 from cutting_trainer_msgs.msg import CutReport, Mesh, MeshDelta
 from cutting_trainer_msgs.srv import Cut, GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.node import Node
 
 from cutting.method import CutResult, SweepError, check_sweep
 from cutting.methods import make_method
@@ -17,84 +16,102 @@ from cutting.warm_up import warm_up
 from tissue_sim import ros
 from tissue_sim.blade import Sweep
 from tissue_sim.errors import MeshError
-from tissue_sim.mesh import TetMesh
-from tissue_sim.messages import delta_into, packed
-from tissue_sim.parameters import scene_parameter, seed_parameter
-from tissue_sim.replica import MeshReplica
+from tissue_sim.lifecycle import ManagedNode, run
+from tissue_sim.mesh import TetMesh, carried_over, grown
+from tissue_sim.messages import delta_into, mesh_message, packed
+from tissue_sim.parameters import max_nodes_parameter, scene_parameter, seed_parameter
+from tissue_sim.refusals import MessageError, require_frame
+from tissue_sim.replica import BYTES_A_NODE, MeshReplica
 from tissue_sim.scene_file import read_section
+from tissue_sim.stamps import REVISIONS
 
 _REMEMBERED = 16
 _PATIENCE = 0.25
 """How long [s] a request waits for the delta that it has overtaken."""
+_OVERTAKEN = 150
+"""Deltas that a request may have overtaken: for what is farther ahead nobody waits."""
 _ASK_AGAIN = 1.0
 """[s] after which a whole mesh that was asked for and did not come is asked for again."""
 
 
-class CuttingNode(Node):
+_REASONS = {
+    Cut.Response.WRONG_REVISION: 'wrong revision',
+    Cut.Response.INVALID_SWEEP: 'invalid sweep',
+    Cut.Response.NOT_READY: 'not ready',
+    Cut.Response.INTERNAL: 'the cut failed',
+}
+"""Of requests that are refused, by the code of the answer."""
+
+
+class CuttingNode(ManagedNode):
     """Keeps a replica of the tissue and what the method remembers; see docs/cutting.md."""
 
     def __init__(self) -> None:
         super().__init__('cutting')
+
+    def configure(self) -> None:
+        """Reads the scene, makes the method and the service."""
         scene = Path(scene_parameter(self))
         seed_parameter(self)
         self._settings = read_section(scene, 'cutting', CuttingSettings)
         warm_up(self._settings)
         self._method = make_method(self._settings)
-        self._replica = MeshReplica()
+        most = max_nodes_parameter(self)
+        self._replica, self._largest = MeshReplica(most), BYTES_A_NODE * most
         self._mesh: TetMesh | None = None
         self._displacements: deque[tuple[int, np.ndarray]] = deque(maxlen=_REMEMBERED)
+        self._ahead: np.ndarray | None = None  # displacement of what was answered last
         self._asked = -_ASK_AGAIN
         self._counts: Counter[str] = Counter()
         self._slowest = 0.0
-        self.create_subscription(Mesh, ros.MESH, self._take_mesh, ros.LATCHED)
-        self._deltas = self.create_subscription(
-            MeshDelta, ros.MESH_UPDATES, self._take_delta, ros.UPDATES
+        most = self._largest
+        ros.listen(self, Mesh, ros.MESH, self._take_mesh, ros.LATCHED, most=most)
+        self._deltas = ros.listen(
+            self, MeshDelta, ros.MESH_UPDATES, self._take_delta, ros.UPDATES, most=most
         )
         self._get_mesh = self.create_client(GetMesh, ros.GET_MESH)
         ros.introspect(self, self.create_service(Cut, ros.CUT, self._serve))
+        self.create_service(GetMesh, ros.MESH_KEEPERS[0], self._give_mesh)
         self._diagnostics = ros.Diagnostics(self, self._status)
-        ros.announce_ready(self)
 
     def _take_mesh(self, message: Mesh) -> None:
+        require_frame(ros.MESH, message.header.frame_id)
         # A step that goes back is a new tissue_sim. Any other keyframe is passed over: to load one
         # that overtakes its deltas would drop the stroke; a missing delta shows in the next one.
         if self._mesh is None or message.step < self._replica.step:
             self._load(message)
 
     def _load(self, message: Mesh) -> None:
-        try:
-            self._replica.load(message)
-        except ValueError as error:
-            self._refuse('mesh', str(error))
-            return
+        self._replica.load(message)
         self._rebuild('a full mesh was loaded')
 
     def _rebuild(self, why: str) -> None:
         self._method.abort()
         self._displacements.clear()
+        self._ahead = None
         try:
-            self._mesh = TetMesh(self._replica.rest, self._replica.tetrahedra, self._replica.fixed)
+            self._mesh = self._replica.mesh()
         except MeshError as error:
             self._mesh = None
-            self._refuse('mesh', str(error))
+            self.refusals.add(ros.MESH, error)
             return
-        self._mesh.topology = self._replica.topology
-        self._mesh.set_kinds(self._replica.triangles, self._replica.triangle_kind)
         self._remember()
         self._counts['rebuilt'] += 1
-        self.get_logger().info(f'mesh of {len(self._mesh.tetrahedra)} tetrahedra: {why}')
+        self.get_logger().info(
+            f'mesh of {len(self._mesh.tetrahedra)} tetrahedra: {why}', throttle_duration_sec=0.5
+        )
 
     def _take_delta(self, message: MeshDelta) -> None:
         if self._mesh is None:
             return
+        require_frame(ros.MESH_UPDATES, message.header.frame_id)
         try:
             if not self._replica.apply(message):
                 self._ask_for_mesh()
                 return
-        except ValueError as error:
-            self._refuse('mesh delta', str(error))
+        except MessageError:
             self._ask_for_mesh()
-            return
+            raise
         if message.cut_step and not self._same_mesh():
             self._rebuild('a cut was applied that this node did not make last')
         self._remember()
@@ -126,9 +143,16 @@ class CuttingNode(Node):
         self._asked = -_ASK_AGAIN
         response = future.result()
         if response is not None and response.success:
-            self._load(response.mesh)
+            try:
+                self._load(response.mesh)
+            except MessageError as error:
+                self.refusals.add(ros.GET_MESH, error)
 
     def _serve(self, request: Cut.Request, response: Cut.Response) -> Cut.Response:
+        if not self.is_active:
+            response.error_code = Cut.Response.NOT_READY
+            response.error_msg = 'the node cutting is not active: activate it'
+            return response
         self._catch_up(request.revision)
         begun = time.perf_counter()
         response.revision = request.revision
@@ -137,7 +161,6 @@ class CuttingNode(Node):
         except SweepError as error:
             code, result = (Cut.Response.INVALID_SWEEP, str(error)), None
         except (MeshError, AssertionError, ValueError, KeyError, IndexError) as error:
-            self.get_logger().error(f'cut refused: {type(error).__name__}: {error}')
             self._rebuild('a cut failed')
             code, result = (Cut.Response.INTERNAL, f'{type(error).__name__}: {error}'), None
         response.success = code[0] == Cut.Response.OK
@@ -148,27 +171,50 @@ class CuttingNode(Node):
             response.report = self._report(result, time.perf_counter() - begun)
             self._counts['cuts'] += 1
         else:
-            self._refuse('cut', response.error_msg)
+            self.refusals.add(ros.CUT, MessageError(_REASONS[code[0]], response.error_msg))
         self._slowest = max(self._slowest, time.perf_counter() - begun)
+        return response
+
+    def _give_mesh(self, _: GetMesh.Request, response: GetMesh.Response) -> GetMesh.Response:
+        """The tissue as it was, with the last cut that was answered, for a new `tissue_sim`."""
+        mesh, replica = self._mesh, self._replica
+        if mesh is None:
+            return response
+        displacement, revision = replica.displacement, replica.revision
+        if mesh.topology != replica.topology and self._ahead is not None:
+            displacement, revision = self._ahead[: mesh.node_count], revision + 1
+        self._method.abort()
+        now = time.time_ns()
+        response.mesh = mesh_message(mesh, displacement, '', revision, replica.step, now)
+        response.success = True
         return response
 
     def _catch_up(self, revision: int) -> None:
         """Takes the deltas up to a revision: a request may overtake the one it belongs to."""
         deadline = time.monotonic() + _PATIENCE
-        while self._mesh is not None and self._replica.revision < revision and not self._asking:
-            delta = ros.take(self._deltas)
-            if delta is not None:
-                self._take_delta(delta)
-            elif time.monotonic() > deadline:
+        while self._mesh is not None and self._overtaken(revision) and not self._asking:
+            if time.monotonic() > deadline:
                 return
-            else:
-                time.sleep(0.0005)
+            try:
+                if (delta := ros.take(self._deltas, self._largest)) is None:
+                    time.sleep(0.0005)
+                else:
+                    self._take_delta(delta)
+            except MessageError as error:
+                self.refusals.add(ros.MESH_UPDATES, error)
+
+    def _overtaken(self, revision: int) -> bool:
+        """Whether the deltas up to a revision are on their way."""
+        ahead = (revision - self._replica.revision) % REVISIONS
+        return 0 < ahead <= _OVERTAKEN
 
     def _cut(self, request: Cut.Request) -> tuple[tuple[int, str], CutResult | None]:
         if self._mesh is None:
             return (Cut.Response.NOT_READY, 'no mesh has come yet on tissue/mesh'), None
         displacement = dict(self._displacements).get(request.revision)
         if displacement is None or len(displacement) != len(self._replica.rest):
+            if (request.revision - self._replica.revision) % REVISIONS > _OVERTAKEN:
+                self._ask_for_mesh()  # the revision here may never have been one
             first, last = self._displacements[0][0], self._displacements[-1][0]
             text = f'revision {request.revision} is not at hand; revisions {first} to {last} are'
             text += ', and the whole mesh has been asked for' if self._asking else ''
@@ -192,7 +238,10 @@ class CuttingNode(Node):
             text = f'command {request.command} is none of ADVANCE 0, FINISH 1, ABORT 2'
             return (Cut.Response.INVALID_SWEEP, text), None
         if not result.delta.empty:
-            self._mesh.apply(result.delta)
+            count = self._mesh.node_count
+            touched = self._mesh.apply(result.delta)
+            self._ahead = grown(displacement.copy(), count + len(result.delta.node_parents))
+            carried_over(self._ahead, count, result.delta, touched)
         return (Cut.Response.OK, ''), result
 
     def _report(self, result: CutResult, seconds: float) -> CutReport:
@@ -211,10 +260,6 @@ class CuttingNode(Node):
             warnings=list(report.warnings),
         )
 
-    def _refuse(self, what: str, why: str) -> None:
-        self._counts[f'refused {what}'] += 1
-        self.get_logger().warning(f'{what} refused: {why}', throttle_duration_sec=1.0)
-
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         values: dict[str, object] = dict(self._counts)
         values |= {
@@ -229,7 +274,7 @@ class CuttingNode(Node):
 
 def main() -> None:
     """Runs the node."""
-    ros.run(CuttingNode)
+    run(CuttingNode)
 
 
 if __name__ == '__main__':

@@ -7,9 +7,14 @@ from numba import njit
 
 from haptic_bridge.arm_settings import ArmSettings
 from haptic_bridge.hand import Hand
+from tissue_sim.refusals import MessageError, Refusals
 
 _NANOSECONDS = 1_000_000_000
 _LONGEST_SUBSTEP = 0.25e-3
+COMMAND = 'arm/servo_cf'
+_INVALID = MessageError('marked invalid', 'its stamp is 0')
+_NOT_FINITE = MessageError('not finite')
+_OUTDATED = MessageError('not newer than the one before')
 
 
 class EmulatedArm:
@@ -27,6 +32,7 @@ class EmulatedArm:
         settings: the scene's section `arm`.
         hand: what holds it.
         body_force: whether commands are in the axes of the tool instead of the base.
+        refusals: to count in; None: its own.
 
     Attributes:
         true_position, true_velocity: of the mass [m], [m/s], shape (3,).
@@ -36,11 +42,18 @@ class EmulatedArm:
         angular_velocity: [rad/s], base axes, shape (3,).
         force: of the motors on the hand, base axes [N], shape (3,).
         watchdog_trips: how often commands stopped, whatever force they had asked for.
-        rejected: commands with NaN, an invalid stamp, or a stamp not newer than the last.
+        refusals: of commands with NaN, an invalid stamp, or a stamp not newer than the last.
         script_time: [s] that the script has run.
     """
 
-    def __init__(self, settings: ArmSettings, hand: Hand, *, body_force: bool = False) -> None:
+    def __init__(
+        self,
+        settings: ArmSettings,
+        hand: Hand,
+        *,
+        body_force: bool = False,
+        refusals: Refusals | None = None,
+    ) -> None:
         self._settings = settings
         self._hand = hand
         self._body_force = body_force
@@ -63,7 +76,7 @@ class EmulatedArm:
         self.angular_velocity = np.zeros(3)
         self.force = np.zeros(3)
         self.watchdog_trips = 0
-        self.rejected = 0
+        self.refusals = refusals or Refusals()
         self.script_time = 0.0
         self.script_running = False
 
@@ -89,18 +102,20 @@ class EmulatedArm:
             force: of the device on the hand [N], shape (3,).
             now_ns: arrival on the arm's own monotonic clock [ns].
         """
-        if stamp_ns == 0 or not all(map(math.isfinite, force)):
-            self.reject()
+        if stamp_ns == 0:
+            self.refuse(_INVALID)
+        elif not all(map(math.isfinite, force)):
+            self.refuse(_NOT_FINITE)
         elif stamp_ns <= self._command_stamp:
-            self.rejected += 1
+            self.refusals.add(COMMAND, _OUTDATED)
         else:
             self._command_stamp = stamp_ns
             self._command_ns = now_ns
             self._command[:] = force
 
-    def reject(self) -> None:
+    def refuse(self, why: MessageError) -> None:
         """Takes a command that cannot be understood: the motors go to zero."""
-        self.rejected += 1
+        self.refusals.add(COMMAND, why)
         self._command[:] = 0
         self._delay_line[:] = 0
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
-from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Joy
 
@@ -22,20 +21,20 @@ from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.stream_watch import StreamWatch
 from haptic_bridge.wire import PoseStampedCodec, TwistStampedCodec, WireError, WrenchStampedCodec
+from tissue_sim.lifecycle import ManagedNode, Stop, announce_ready, run
 from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
+from tissue_sim.refusals import MessageError, require_frame
 from tissue_sim.ros import (
     ARM,
     EVENTS,
-    FRAME,
     HAND,
     LATCHED,
     NEWEST_BEST_EFFORT,
     STREAM,
     Diagnostics,
-    Stop,
-    announce_ready,
+    listen,
     polled,
-    run,
+    stamp,
     take_numbered,
 )
 from tissue_sim.scene_file import read_section
@@ -44,10 +43,12 @@ from tissue_sim.timing import Durations, PeriodicLoop
 _LONGEST_CATCH_UP = 50
 _LONGEST_SCRIPT = 86400.0
 """[s]"""
+_FARTHEST_GOAL = 1.0
+"""[m] from the origin of the tissue frame that a goal of the hand may be."""
 _NO_TORQUE = (0.0, 0.0, 0.0)
 
 
-class ArmNode(Node):
+class ArmNode(ManagedNode):
     """Publishes where the arm is, takes the force for the hand.
 
     Parameters:
@@ -68,6 +69,9 @@ class ArmNode(Node):
 
     def __init__(self) -> None:
         super().__init__('emulated_arm')
+
+    def configure(self) -> None:
+        """Reads the scene, makes the arm, its hand and its topics."""
         scene = Path(scene_parameter(self))
         text = "duration that the script is stretched to [s]; 0: the script's own"
         seconds = float(parameter(self, 'seconds', 0.0, text, within=(0.0, _LONGEST_SCRIPT)))
@@ -85,7 +89,7 @@ class ArmNode(Node):
 
         def new_arm() -> EmulatedArm:
             hand = Hand(settings.hand, script, seed)
-            return EmulatedArm(settings, hand, body_force=body_force)
+            return EmulatedArm(settings, hand, body_force=body_force, refusals=self.refusals)
 
         for guide in (False, True):  # compiles the kernels before the clock runs
             arm = new_arm()
@@ -119,13 +123,14 @@ class ArmNode(Node):
         self._button = self.create_publisher(Joy, f'{ARM}/button', EVENTS)
         self._pressed: bool | None = None
         self._states = StateInterface(self, ARM, self._machine)
-        self._bridge = self.create_subscription(
+        self._bridge = listen(
+            self,
             crtk_types().operating_state,
             'haptic_bridge/operating_state',
             self._bridge_state,
             LATCHED,
         )
-        self._goals = self.create_subscription(PoseStamped, HAND, self._guide, EVENTS)
+        self._goals = self.create_subscription(PoseStamped, HAND, self._guide, EVENTS, raw=True)
         self._real_time = ''
         self._diagnostics = Diagnostics(self, self._status)
 
@@ -137,7 +142,7 @@ class ArmNode(Node):
         announce_ready(self)
         run_real_time(self._loop, self._tick, stop)
 
-    def close(self) -> None:
+    def release(self) -> None:
         """Publishes the last totals."""
         self._diagnostics.publish()
 
@@ -164,8 +169,7 @@ class ArmNode(Node):
         try:
             stamp, _, values = self._cf.decode(taken[0])
         except WireError as error:
-            self._arm.reject()
-            self.get_logger().error(str(error), throttle_duration_sec=1.0)
+            self._arm.refuse(error)
             return
         self._force_age.add(time.time_ns() - stamp)
         # Its stamps are the bridge's affair: the watchdog goes by arrivals.
@@ -179,7 +183,7 @@ class ArmNode(Node):
         if pressed is not self._pressed:
             self._pressed = pressed
             message = Joy(buttons=[int(pressed)])
-            message.header.stamp = self.get_clock().now().to_msg()
+            message.header.stamp = stamp(time.time_ns())
             self._button.publish(message)
 
     def _publish(self, stamp: int) -> None:
@@ -191,22 +195,21 @@ class ArmNode(Node):
         self._measured_cv.publish(self._cv.encode(stamp, twist))
         self._measured_cf.publish(self._cf.encode(stamp, wrench))
 
-    def _guide(self, message: PoseStamped) -> None:
+    def _guide(self, data: bytes) -> None:
         """Takes a goal for the hand; what cannot be one is refused, and the hand stays."""
-        p, q = message.pose.position, message.pose.orientation
-        position, turn = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
-        if message.header.frame_id != FRAME:
-            problem = f'its frame is {message.header.frame_id!r}: give {FRAME!r}'
-        elif not np.isfinite([*position, *turn]).all():
-            problem = 'a number is not finite'
-        elif abs(np.linalg.norm(turn) - 1) > 0.01:
-            problem = f'its quaternion has length {np.linalg.norm(turn):.3g}: it must be 1'
-        else:
-            to_device = Rotation.from_matrix(self._frame.rotation()).inv()
-            orientation = (to_device * Rotation.from_quat(turn)).as_quat()
-            self._arm.guide(self._frame.to_device(position), orientation)
+        try:
+            goal = self._cp.believed(data)
+            require_frame(HAND, goal.frame_id)
+            position, turn = np.array(goal.values[:3]), np.array(goal.values[3:])
+            if np.linalg.norm(position) > _FARTHEST_GOAL:
+                text = f'{position} m is farther than {_FARTHEST_GOAL:g} m'
+                raise MessageError('not finite or too far', text)
+        except MessageError as error:
+            self.refusals.add(HAND, error)
             return
-        self.get_logger().warning(f'goal of the hand refused: {problem}', throttle_duration_sec=1.0)
+        to_device = Rotation.from_matrix(self._frame.rotation()).inv()
+        orientation = (to_device * Rotation.from_quat(turn)).as_quat()
+        self._arm.guide(self._frame.to_device(position), orientation)
 
     def _bridge_state(self, message: Any) -> None:
         self._bridge_enabled = message.state == State.ENABLED
@@ -221,7 +224,6 @@ class ArmNode(Node):
                 'state': machine.state,
                 'real_time': self._real_time,
                 'watchdog_trips': arm.watchdog_trips,
-                'rejected': arm.rejected,
                 'force_norm': math.hypot(*arm.force.tolist()),
                 'phase': name,
                 'phase_kind': kind,
@@ -236,7 +238,7 @@ class ArmNode(Node):
 
 def main() -> None:
     """Entry point of the process."""
-    run(ArmNode, ArmNode.work)
+    run(ArmNode)
 
 
 if __name__ == '__main__':

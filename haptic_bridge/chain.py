@@ -45,7 +45,6 @@ STATE = np.dtype(
         ('moved', 'f8', (3,)),  # [m] since the last tick, device frame
         ('velocity', 'f8', (3,)),  # [m/s], device frame
         ('proxy', 'f8', (3,)),  # [m] on the surface without the dent
-        ('spread', 'f8'),  # sum of the squared shares of the touched nodes
         ('normal', 'f8', (3,)),
         ('external', 'f8', (3,)),  # [N] on the tissue
         ('resistance', 'f8'),  # [N]
@@ -135,9 +134,7 @@ def _tissue_force(
     if h.count > 0 and not (c.one_force and contact == TOUCHING):
         depth = s.proxy - s.tip
         touching = contact == TOUCHING
-        extrapolation.estimate(
-            c.law, history, time, s.tip, depth, s.spread, touching, c.max_stiffness, out
-        )
+        extrapolation.estimate(c.law, history, time, s.tip, depth, touching, c.max_stiffness, out)
     elif contact == TOUCHING:
         out[:] = -s.external  # as long as the tissue has not answered
         if h.count == 0 and not np.any(h.stiffness):

@@ -86,11 +86,9 @@ def _write(surface: Geometry, slot: int, weights: np.ndarray, state: np.ndarray)
     s.nodes[:] = 0
     s.weights[:] = 0.0
     s.contact[:] = 0.0
-    s.spread = 0.0
     for j in range(3):
         s.nodes[j] = surface.triangles[near.triangle[slot], j]
         s.weights[j] = weights[j]
-        s.spread += weights[j] * weights[j]
         for axis in range(3):
             s.contact[axis] += weights[j] * near.corners[3 * j + axis, slot]
 

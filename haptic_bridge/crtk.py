@@ -2,19 +2,28 @@
 to hold.
 """
 
+import time
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from sensor_msgs.msg import Joy
 
 from haptic_bridge.operating_state import (
+    COMMANDS,
+    E_STOP,
     OperatingStateMachine,
     State,
     crtk_types,
     device_cause,
 )
-from tissue_sim.ros import EVENTS, LATCHED, introspect
+from tissue_sim.lifecycle import ManagedNode
+from tissue_sim.refusals import MessageError
+from tissue_sim.ros import EVENTS, LATCHED, introspect, listen, stamp
+
+LONGEST_STATE = 64
+"""Characters of an operating state's name."""
+FAULTS_SAID = 0.1
+"""[s] between two lines of the log about a FAULT."""
 
 
 class StateInterface:
@@ -26,16 +35,15 @@ class StateInterface:
         machine: shared with the loop of the node, which calls `publish_changes`.
     """
 
-    def __init__(self, node: Node, name: str, machine: OperatingStateMachine) -> None:
+    def __init__(self, node: ManagedNode, name: str, machine: OperatingStateMachine) -> None:
         types = crtk_types()
         self._node = node
         self._machine = machine
         self._message = types.operating_state
         self._published = -1
         self._publisher = node.create_publisher(self._message, f'{name}/operating_state', LATCHED)
-        self._commands = node.create_subscription(
-            types.command, f'{name}/state_command', self._command, EVENTS
-        )
+        self._topic = f'{name}/state_command'
+        self._commands = listen(node, types.command, self._topic, self._command, EVENTS)
         self._query = node.create_service(types.query, f'{name}/operating_state', self._answer)
         introspect(node, self._query)
         self.publish_changes()
@@ -47,13 +55,18 @@ class StateInterface:
         self._published = self._machine.changes
         self._publisher.publish(self._current())
         if self._machine.reason:
-            self._node.get_logger().error(f'FAULT: {self._machine.reason}')
+            self._node.get_logger().error(
+                f'FAULT: {self._machine.reason}', throttle_duration_sec=FAULTS_SAID
+            )
+        else:
+            self._node.get_logger().info(f'{self._machine.state}', throttle_duration_sec=1.0)
 
     def _command(self, message: Any) -> None:
         refused = self._machine.command(message.string)
-        if refused:
-            self._node.get_logger().warning(refused)
         self.publish_changes()
+        if refused:
+            known = message.string in (*COMMANDS, E_STOP)
+            raise MessageError('not valid now' if known else 'no such command', refused)
 
     def _answer(self, _request: Any, response: Any) -> Any:
         response.operating_state = self._current()
@@ -65,7 +78,7 @@ class StateInterface:
             is_homed=self._machine.is_homed,
             is_busy=self._machine.is_busy,
         )
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = stamp(time.time_ns())
         return message
 
 
@@ -85,7 +98,7 @@ class DeviceState:
         cause: why it gives no force, as a sentence; '' if it does or has not said.
     """
 
-    def __init__(self, node: Node, name: str, machine: OperatingStateMachine) -> None:
+    def __init__(self, node: ManagedNode, name: str, machine: OperatingStateMachine) -> None:
         self.state = self.cause = ''
         self._machine = machine
         # That a device does not latch is no reason for a warning of the middleware.
@@ -94,11 +107,13 @@ class DeviceState:
         )
         kind, topic = crtk_types().operating_state, f'{name}/operating_state'
         self._subscriptions = [
-            node.create_subscription(kind, topic, self._hear, qos, event_callbacks=quiet)
+            listen(node, kind, topic, self._hear, qos, event_callbacks=quiet)
             for qos in (LATCHED, EVENTS)
         ]
 
     def _hear(self, message: Any) -> None:
+        if len(message.state) > LONGEST_STATE or not message.state.isprintable():
+            raise MessageError('no such state', f'a state has {LONGEST_STATE} characters at most')
         self.state = message.state
         self.cause = device_cause(message.state, is_homed=message.is_homed)
         if self.cause and self._machine.state is State.ENABLED:
@@ -116,14 +131,17 @@ class HoldButton:
         machine: of the bridge.
     """
 
-    def __init__(self, node: Node, name: str, machine: OperatingStateMachine) -> None:
+    def __init__(self, node: ManagedNode, name: str, machine: OperatingStateMachine) -> None:
         self._machine = machine
         self._pressed = self._paused = False
-        self._presses = node.create_subscription(Joy, f'{name}/button', self._event, EVENTS)
+        self._presses = listen(node, Joy, f'{name}/button', self._event, EVENTS)
 
     def _event(self, message: Joy) -> None:
-        self._pressed = bool(message.buttons) and message.buttons[0] == 1
+        known = bool(message.buttons) and message.buttons[0] in (0, 1)
+        self._pressed = known and message.buttons[0] == 1
         self.enforce()
+        if not known:  # and counts as let go
+            raise MessageError('no such button', 'buttons[0] has to be 0 or 1')
 
     def enforce(self) -> None:
         """Makes the state what the button asks for; call often."""

@@ -20,8 +20,8 @@ FARTHEST = 3.0
 """Intervals between samples that a line is followed: one to compute, one to wait, one lost."""
 SHORTEST = 5e-5
 """[m] Below this distance of two samples their line is encoder noise: the force is held instead."""
-_NEIGHBOUR = 0.2
-"""What a load on a node moves a neighbour by, over what it moves the node: fitted on the liver."""
+_MOST_CHANGE = 2.0
+"""By which factor the stiffness may change on the way from the newest sample."""
 
 HISTORY = np.dtype(
     [
@@ -31,7 +31,6 @@ HISTORY = np.dtype(
         ('force', 'f8', (2, 3)),  # [N]
         ('stiffness', 'f8', (3, 3)),  # [N/m] of the newest, -d(force)/d(position)
         ('depth', 'f8', (3,)),  # [m] from tip to proxy in the contact that the newest answers
-        ('spread', 'f8'),  # sum of the squared shares of the nodes in it
         ('topology', 'i8'),
         ('state', 'i8'),
     ]
@@ -131,12 +130,47 @@ def local_stiffness(
 
 @njit(cache=True, nogil=True)
 def surface_stiffness(stiffness: np.ndarray, largest: float) -> float:
-    """Gives k of a frictionless contact K = k n n^T [N/m], shape (3, 3); `largest` if unknown.
+    """Gives k of a frictionless contact K = k n n^T - n g^T, g along the surface [N/m].
 
-    The normal may turn on the way, k is taken along.
+    `largest` if it is unknown. The normal may turn on the way, k is taken along.
     """
-    k = np.sqrt(np.sum(stiffness * stiffness))
+    k = stiffness[0, 0] + stiffness[1, 1] + stiffness[2, 2]
     return k if 0.0 < k < largest else largest
+
+
+@njit(cache=True, nogil=True)
+def stiffness_on_way(
+    stiffness: np.ndarray,
+    depth: np.ndarray,
+    force: np.ndarray,
+    way: np.ndarray,
+    largest: float,
+) -> float:
+    """Gives k of a contact where the tool has come to [N/m].
+
+    K = k n n^T - (F / k) n (grad k)^T says how k changes along the surface; it is followed to
+    `_MOST_CHANGE` times and through `_MOST_CHANGE`.
+
+    Args:
+        stiffness: K [N/m], shape (3, 3).
+        depth: from the tip to the proxy, along n [m], shape (3,).
+        force: [N], shape (3,); F is its part along n.
+        way: of the tip since then [m], shape (3,).
+        largest: [N/m].
+    """
+    k = surface_stiffness(stiffness, largest)
+    size = np.sqrt(depth[0] ** 2 + depth[1] ** 2 + depth[2] ** 2)
+    pressed = drop = 0.0
+    for i in range(3):
+        n = depth[i] / size if size > 0.0 else 0.0
+        pressed += n * force[i]
+        for j in range(3):
+            drop += n * stiffness[i, j] * way[j]
+        drop -= k * n * way[i]
+    if k >= largest or pressed <= 0.0:
+        return k
+    change = min(max(1.0 - drop / pressed, 1.0 / _MOST_CHANGE), _MOST_CHANGE)
+    return min(k * change, largest)
 
 
 @njit(cache=True, nogil=True)
@@ -177,33 +211,12 @@ def local_surface(
 
 
 @njit(cache=True, nogil=True)
-def elsewhere(stiffness: float, coupling: float, before: float, here: float) -> float:
-    """Stiffness of spring and tissue in series where the load is spread otherwise [N/m].
-
-    A point load sinks deeper at a node than between nodes, by up to half on a coarse mesh. With
-    equal nodes and the part `_NEIGHBOUR` of the sinking at their neighbours, shares w give the
-    tissue a compliance in proportion to `_NEIGHBOUR` + (1 - `_NEIGHBOUR`) sum w^2.
-
-    Args:
-        stiffness: where it is known, in series with the coupling [N/m].
-        coupling: [N/m].
-        before, here: sum of the squared shares of the nodes there and here, 0 where unknown.
-    """
-    if before <= 0.0 or here <= 0.0 or stiffness >= coupling:
-        return stiffness
-    soft = 1.0 / stiffness - 1.0 / coupling
-    soft *= (_NEIGHBOUR + (1.0 - _NEIGHBOUR) * here) / (_NEIGHBOUR + (1.0 - _NEIGHBOUR) * before)
-    return 1.0 / (1.0 / coupling + soft)
-
-
-@njit(cache=True, nogil=True)
 def estimate(
     law: int,
     history: np.ndarray,
     time: int,
     position: np.ndarray,
     depth: np.ndarray,
-    spread: float,
     touching: bool,
     max_stiffness: float,
     out: np.ndarray,
@@ -218,7 +231,6 @@ def estimate(
         time: [ns] of the device pose.
         position: of the tool tip [m], shape (3,).
         depth: from there to the proxy [m], shape (3,).
-        spread: sum of the squared shares of the touched nodes.
         touching: the tool is on the surface, not in the tissue.
         max_stiffness: [N/m].
         out: [N], shape (3,).
@@ -226,8 +238,9 @@ def estimate(
     h = history[0]
     local = law == LOCAL_STIFFNESS or (law == POSITION and h.count < 2)
     if local and touching:
+        way = position - h.position[1]
         k = surface_stiffness(h.stiffness, max_stiffness)
-        here = elsewhere(k, max_stiffness, h.spread, spread)
+        here = stiffness_on_way(h.stiffness, h.depth, h.force[1], way, max_stiffness)
         local_surface(depth, h.depth, h.force[1], k, here, out)
     elif local:
         local_stiffness(position, h.position[1], h.force[1], h.stiffness, max_stiffness, out)
@@ -251,7 +264,6 @@ def push(
     force: np.ndarray,
     stiffness: np.ndarray,
     depth: np.ndarray,
-    spread: float,
     *,
     topology: int,
     state: int,
@@ -266,7 +278,6 @@ def push(
         stiffness: [N/m], shape (3, 3); all zero where the simulation has none: the last known one
             is kept.
         depth: from tip to proxy in the contact that the sample answers [m], shape (3,).
-        spread: sum of the squared shares of the nodes in it.
         topology: connectivity count of the mesh that the sample stems from.
         state: contact state that it stems from.
     """
@@ -279,6 +290,5 @@ def push(
     if np.any(stiffness):
         h['stiffness'] = stiffness
     h['depth'] = depth
-    h['spread'] = spread
     h['topology'] = topology
     h['state'] = state

@@ -25,6 +25,7 @@ from haptic_bridge.settings import (
 from haptic_bridge.surface import Surface
 from haptic_bridge.tissue_sample import TissueSample
 from haptic_bridge.wire import Sample
+from tissue_sim.refusals import MessageError, Refusals
 
 _SECOND = 1e-9
 _LONGEST_STEP = 0.005
@@ -36,6 +37,9 @@ _REMEMBERED = 4096
 ENERGY_CREDIT = 2e-4
 """[J] that the force loop may have made in all before the passivity controller acts, a fifth of
 what a press of 5 mm on liver stores: below it are encoder steps and errors of extrapolation."""
+POSE, FORCE = 'arm/measured_cp', 'tissue/force'
+_INVALID = MessageError('marked invalid', 'its stamp is 0')
+_OUTDATED = MessageError('not newer than the one before')
 _NOWHERE = ((0,) * 9, (0.0,) * 9, (0.0,) * 3, (0.0,) * 3)
 
 
@@ -65,10 +69,11 @@ class ForcePath:
     Args:
         tool, device, haptics: sections of the scene.
         profile: limits of the device.
+        refusals: to count in; None: its own.
 
     Attributes:
         stale_trips: how often the simulation's data went stale while enabled.
-        rejected: messages that were refused: repeated, out of order, marked invalid.
+        refusals: messages that were refused: repeated, out of order, marked invalid.
         contact_time: total [s].
         max_force: largest norm commanded [N].
 
@@ -82,12 +87,13 @@ class ForcePath:
         device: DeviceSettings,
         haptics: HapticsSettings,
         profile: DeviceProfile,
+        refusals: Refusals | None = None,
     ) -> None:
         check_together(tool, device, haptics, profile)
         self.haptics = haptics
         self._tool, self._device, self._profile = tool, device, profile
         self.stale_trips = 0
-        self.rejected = 0
+        self.refusals = refusals or Refusals()
         self.contact_time = 0.0
         self.max_force = 0.0
         self._setup = chain.make_setup(tool, device, haptics, profile)
@@ -103,7 +109,7 @@ class ForcePath:
         self._sample_state = NONE
         self._ground = Ground()
         self._sequence = self._began = self._left = 0
-        self._depths = np.zeros((_REMEMBERED, 4))
+        self._depths = np.zeros((_REMEMBERED, 3))
         self._contact = NONE
         self._was_enabled = self._stale = False
 
@@ -221,14 +227,14 @@ class ForcePath:
         # After a silence without force anything is a new start: a device may have another clock.
         known = enabled or self.pose_age(now_ns) <= self.haptics.device_timeout
         if pose.stamp_ns == 0 or (known and pose.stamp_ns <= self._pose_stamp):
-            self.rejected += 1
+            self.refusals.add(POSE, _OUTDATED if pose.stamp_ns else _INVALID)
             return ''
         known = known and enabled
         elapsed = (pose.stamp_ns - self._pose_stamp) * _SECOND if known else np.inf
         self._pose[:] = pose.values
         code = safety.pose_gate(self._pose[:3], self._pose[3:], self._s['device'], elapsed)
         if code != safety.OK:
-            self.rejected += 1
+            self.refusals.add(POSE, MessageError(safety.POSE_FAULTS[code]))
             return safety.POSE_FAULTS[code]
         chain.to_tissue(self._setup, self._state, self._pose)
         if not known:
@@ -242,12 +248,12 @@ class ForcePath:
         said = TissueSample.read(sample)
         fresh = (now_ns - self._sample_ns) * _SECOND <= self.haptics.stale_after
         if sample.stamp_ns == 0 or (fresh and said.step <= self._step):
-            self.rejected += 1
+            self.refusals.add(FORCE, _OUTDATED if sample.stamp_ns else _INVALID)
             return ''
         if problem := said.problem:
-            self.rejected += 1
+            self.refusals.add(FORCE, problem)
             extrapolation.clear(self._history)
-            return problem
+            return str(problem)
         if not fresh:
             extrapolation.clear(self._history)
         self._step, self._sample_revision = said.step, said.revision
@@ -263,8 +269,7 @@ class ForcePath:
                 said.position,
                 said.force,
                 said.stiffness,
-                there[:3],
-                there[3],
+                there,
                 topology=said.topology,
                 state=said.state,
             )
@@ -326,10 +331,8 @@ class ForcePath:
         assert ground is not None
         touched = self._proxy.step(ground, self._ground.blend(now_ns), self._s['tip'])
         self._s['proxy'] = touched.position
-        self._s['spread'] = touched.spread
         slot = self._sequence % _REMEMBERED
-        self._depths[slot, :3] = touched.position - self._s['tip']
-        self._depths[slot, 3] = touched.spread
+        self._depths[slot] = touched.position - self._s['tip']
         self._contact = TOUCHING if touched.touching else NONE
         if self._contact != before:
             extrapolation.clear(self._history)
@@ -378,30 +381,3 @@ class ForcePath:
             *s['blade'].ravel().tolist(),
             self._tail[1],
         )
-
-
-def warm_up(
-    tool: ToolSettings, device: DeviceSettings, haptics: HapticsSettings, profile: DeviceProfile
-) -> ForcePath:
-    """Compiles, or loads from the cache, everything that a tick calls, by touching a triangle.
-
-    Returns:
-        What has touched it.
-    """
-    frame = device.tissue_from_device
-    place = frame.to_tissue(np.zeros(3))
-    corners = place + np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
-    triangle = np.array([[0, 1, 2]], np.int32)
-    surface = Surface(corners, triangle, revision=0, topology=0)
-    path = ForcePath(tool, device, haptics, profile)
-    # What is not yet ENABLED cannot jump.
-    states = (State.DISABLED, *(State.ENABLED,) * 4)
-    for i, (state, height) in enumerate(zip(states, (1.01, 1.01, 0.99, 0.99, 0.99), strict=True)):
-        tip = frame.to_device(place + np.array([0.0, 0.0, height * tool.radius]))
-        stamp = (i + 1) * 1_000_000
-        pose = Sample(stamp, '', (*tip.tolist(), 0.0, 0.0, 0.0, 1.0))
-        sample = Sample(stamp, '', (i, i, 0, i, 0, stamp, TOUCHING) + (1e-3,) * 18)
-        path.tick(stamp, state=state, pose=pose, sample=sample, surface=surface)
-        surface = Surface(corners, triangle, revision=i + 1, topology=0, previous=surface)
-        corners = corners + 1e-5
-    return path

@@ -11,27 +11,30 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from haptic_bridge.convention import DeviceConvention
 from haptic_bridge.crtk import DeviceState, HoldButton, StateInterface
-from haptic_bridge.force_path import ForcePath, warm_up
+from haptic_bridge.force_path import ForcePath
 from haptic_bridge.operating_state import OperatingStateMachine, State
 from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
 from haptic_bridge.stream_watch import StreamWatch
 from haptic_bridge.surface import Surface
+from haptic_bridge.warm_up import warm_up
 from haptic_bridge.wire import (
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
     Sample,
+    WireError,
     WrenchStampedCodec,
 )
 from tissue_sim import ros
-from tissue_sim.mesh_follower import MeshFollower, require_frame
+from tissue_sim.lifecycle import ManagedNode, Stop, announce_ready, run
+from tissue_sim.mesh_follower import MeshFollower
 from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
+from tissue_sim.refusals import require_frame
 from tissue_sim.scene_file import read_section
 from tissue_sim.timing import Durations, PeriodicLoop
 
@@ -48,32 +51,42 @@ class SimulationFollower:
 
     Args:
         node: to subscribe with.
-        on_error: told, as a sentence, what message could not be used.
+        on_error: told, as a sentence, that a message could not be used.
 
     Attributes:
         surface: the newest whole one; None before the first.
         samples: forces that the fast loop has not taken yet.
     """
 
-    def __init__(self, node: Node, on_error: Callable[[str], None]) -> None:
+    def __init__(self, node: ManagedNode, on_error: Callable[[str], None]) -> None:
         self.surface: Surface | None = None
         self.samples: deque[Sample] = deque(maxlen=4)
         self._on_error = on_error
-        self._follower = MeshFollower(node)
+        self._refusals = node.refusals
+        self._follower = MeshFollower(node, node.refusals)
         self._codec = ForceSampleCodec()
-        self._watch = StreamWatch(ros.FORCE)
-        self._force = ros.polled(node, ForceSample, ros.FORCE, ros.STREAM)
+        self._watch = StreamWatch(ros.FORCE, queues=True)
+        self._late = 0
+        self._force = ros.polled(node, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
 
     @property
-    def gaps(self) -> int:
-        """How often a revision was missed."""
-        return self._follower.gaps
+    def report(self) -> dict[str, object]:
+        """What /diagnostics says of the simulation's messages; of the mesh see `MeshFollower`."""
+        revision, known = self._follower.checked
+        return {
+            'late_forces': self._late,
+            'revision_gaps': self._follower.gaps,
+            'mesh_checked_revision': revision,
+            'mesh_checked_hash': f'{known:016x}',
+            'mesh_mismatches': self._follower.mismatches,
+            'stale_meshes': self._follower.stale,
+        }
 
     def cause(self, now_ns: int) -> str:
         """Why the simulation's forces cannot be trusted at this time [ns], '' if they can."""
         return self._watch.cause(now_ns)
 
-    def run(self, stop: ros.Stop) -> None:
+    def run(self, stop: Stop) -> None:
         """Follows until `stop` is set."""
         while not stop.is_set():
             self.poll()
@@ -81,10 +94,11 @@ class SimulationFollower:
 
     def poll(self) -> None:
         """Takes what has arrived; what is wrong with one topic keeps none of the others waiting."""
-        for take in (self._take_force, self._take_surface):
+        for topic, take in ((ros.FORCE, self._take_force), (ros.MESH, self._take_surface)):
             try:
                 take()
             except Exception as error:
+                self._refusals.add(topic, error)
                 self._on_error(f'message of the simulation: {error}')
                 self._follower.ask()
 
@@ -94,14 +108,19 @@ class SimulationFollower:
             return
         sample = self._codec.decode(taken[0])
         require_frame(ros.FORCE, sample.frame_id)
-        self.samples.append(sample)
         problem = self._watch.see(taken[1], sample.stamp_ns, time.monotonic_ns())
+        if self._watch.late:
+            self._late += 1
+        else:
+            self.samples.append(sample)
         if problem:
             self._on_error(problem)
 
     def _take_surface(self) -> None:
         if self._follower.poll():
             self._renew()
+        if self._follower.problem:
+            self._on_error(f'message of the simulation: {self._follower.problem}')
 
     def _renew(self) -> None:
         replica = self._follower.replica
@@ -114,7 +133,7 @@ class SimulationFollower:
         )
 
 
-class HapticBridge(Node):
+class HapticBridge(ManagedNode):
     """The shell of `ForcePath`.
 
     Parameters:
@@ -126,6 +145,9 @@ class HapticBridge(Node):
 
     def __init__(self) -> None:
         super().__init__('haptic_bridge')
+
+    def configure(self) -> None:
+        """Reads the scene, compiles the force path, makes the topics."""
         scene = Path(scene_parameter(self))
         seed_parameter(self)
         text = 'enter ENABLED, once, when device, force and surface are fresh'
@@ -135,7 +157,7 @@ class HapticBridge(Node):
         haptics = read_section(scene, 'haptics', HapticsSettings)
         profile = device.load_profile()
         warm_up(tool, device, haptics, profile)
-        self._path = ForcePath(tool, device, haptics, profile)
+        self._path = ForcePath(tool, device, haptics, profile, self.refusals)
         self._machine = OperatingStateMachine(self._cause)
         self._convention = DeviceConvention(device)
         self._watch = StreamWatch(f'{ros.ARM}/measured_cp')
@@ -161,20 +183,28 @@ class HapticBridge(Node):
         self._diagnostics = ros.Diagnostics(self, self._collect)
         self._states = self.create_timer(STATE_PERIOD, self._watch_state)
 
-    def work(self, stop: ros.Stop) -> None:
+    def work(self, stop: Stop) -> None:
         """Runs the force loop in the calling thread until `stop` is set."""
         follower = threading.Thread(target=self._follower.run, args=(stop,), daemon=True)
         follower.start()
-        ros.announce_ready(self)
+        announce_ready(self)
         self._real_time = prepare()
         self.get_logger().info(self._real_time)
         run_real_time(self._loop, self._tick, stop)
         follower.join(1.0)
 
-    def close(self) -> None:
-        """Leaves no force behind."""
+    def rest(self) -> None:
+        """Leaves no force behind, and none when it works again: that takes a command."""
+        self._auto_enable = False
+        if self._machine.state is not State.FAULT:
+            self._machine.command('disable')
+        self._interface.publish_changes()
         self._send((0.0,) * 6, time.monotonic_ns())
         self._wrench.wait_for_all_acked(Duration(seconds=0.2))
+
+    def release(self) -> None:
+        """Publishes the last totals."""
+        self.remove_on_set_parameters_callback(self._set_parameters)
         self._diagnostics.publish()
 
     def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -221,7 +251,11 @@ class HapticBridge(Node):
         taken = ros.take_numbered(self._pose)
         if taken is None:
             return None
-        sample = self._pose_codec.decode(taken[0])
+        try:
+            sample = self._pose_codec.decode(taken[0])
+        except WireError as error:
+            self.refusals.add(f'{ros.ARM}/measured_cp', error)
+            raise
         problem = self._watch.see(taken[1], sample.stamp_ns, now, sample.frame_id)
         if problem and self._machine.state is State.ENABLED:
             self._machine.fault(problem)
@@ -241,6 +275,7 @@ class HapticBridge(Node):
             self._button.enforce()
         if (
             self._auto_enable
+            and not self._machine.is_stopped
             and not self._device.cause
             and self._path.is_fresh(time.monotonic_ns())
         ):
@@ -279,12 +314,11 @@ class HapticBridge(Node):
             'pose_publishers': publishers,
             'simulation_age': path.simulation_age(now),
             'stale_trips': path.stale_trips,
-            'rejected': path.rejected,
             'force_scale': path.haptics.force_scale,
             'energy': path.energy,
             'damping': path.damping,
             'revision': surface.revision if surface is not None else -1,
-            'revision_gaps': self._follower.gaps,
+            **self._follower.report,
             'tick_us_p50': report.get('busy_p50', 0.0) * 1e6,
             'tick_us_p99': report.get('busy_p99', 0.0) * 1e6,
             'real_time': self._real_time,
@@ -303,7 +337,7 @@ class HapticBridge(Node):
 
 def main() -> None:
     """Runs the node."""
-    ros.run(HapticBridge, HapticBridge.work)
+    run(HapticBridge)
 
 
 if __name__ == '__main__':

@@ -4,32 +4,31 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped, Vector3, WrenchStamped
-from rclpy.node import Node
 from sensor_msgs.msg import Joy
 
 from haptic_bridge.omni import ForceLatch, OmniConvention
 from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.wire import PoseStampedCodec, TwistStampedCodec, WireError, WrenchStampedCodec
+from tissue_sim.lifecycle import ManagedNode, Stop, announce_ready, run
 from tissue_sim.parameters import parameter
 from tissue_sim.ros import (
     ARM,
     EVENTS,
     NEWEST_BEST_EFFORT,
     STREAM,
-    Stop,
-    announce_ready,
     polled,
-    run,
+    stamp,
     take,
     take_raw,
 )
+from tissue_sim.stamps import nanoseconds
 from tissue_sim.timing import PeriodicLoop
 
 RATE = 1000.0
 _NO_TURN = (0.0, 0.0, 0.0)
 
 
-class OmniAdapter(Node):
+class OmniAdapter(ManagedNode):
     """Passes state, button and force on, at 1 kHz.
 
     `omni/state` becomes `arm/measured_cp` and `arm/measured_cv`, `omni/button` (the grey one)
@@ -44,6 +43,9 @@ class OmniAdapter(Node):
 
     def __init__(self) -> None:
         super().__init__('omni_adapter')
+
+    def configure(self) -> None:
+        """Reads its parameters and makes the topics of both sides."""
         default = OmniConvention()
         convention = OmniConvention(
             str(parameter(self, 'unit', default.unit, 'of length in omni/state: m or mm')),
@@ -83,7 +85,7 @@ class OmniAdapter(Node):
         self.get_logger().info(prepare())
         run_real_time(self._loop, self._tick, stop)
 
-    def close(self) -> None:
+    def rest(self) -> None:
         """Leaves no force behind."""
         self._push(_NO_TURN)
 
@@ -101,16 +103,16 @@ class OmniAdapter(Node):
         self._push(self._latch.force(now))
 
     def _pass_on(self, state: Any) -> None:
-        stamp = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
+        valid = nanoseconds(state.header.stamp)
         p, q, v = state.pose.position, state.pose.orientation, state.velocity
         pose = (*self._convention.metres((p.x, p.y, p.z)), q.x, q.y, q.z, q.w)
         twist = (*self._convention.metres((v.x, v.y, v.z)), *_NO_TURN)
-        self._measured_cp.publish(self._codecs[0].encode(stamp, pose))
-        self._measured_cv.publish(self._codecs[1].encode(stamp, twist))
+        self._measured_cp.publish(self._codecs[0].encode(valid, pose))
+        self._measured_cv.publish(self._codecs[1].encode(valid, twist))
 
     def _press(self, event: Any) -> None:
         message = Joy(buttons=[int(event.grey_button), int(event.white_button)])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = stamp(time.time_ns())
         self._button.publish(message)
 
     def _push(self, force: tuple[float, ...]) -> None:
@@ -120,7 +122,7 @@ class OmniAdapter(Node):
 
 def main() -> None:
     """Entry point of the process."""
-    run(OmniAdapter, OmniAdapter.work)
+    run(OmniAdapter)
 
 
 if __name__ == '__main__':

@@ -18,6 +18,7 @@ class State(StrEnum):
 COMMANDS = ('enable', 'disable', 'pause', 'resume', 'home', 'unhome')
 E_STOP = 'e_stop'
 """One more command that CRTK does not have: FAULT from any state, as a red button would do."""
+_STOPPED = 'emergency stop'
 
 # Pairs that are not listed are invalid and change nothing, PAUSED + enable among them.
 _TRANSITIONS = {
@@ -61,6 +62,11 @@ class OperatingStateMachine:
         self._lock = threading.RLock()
 
     @property
+    def is_stopped(self) -> bool:
+        """Whether a person has stopped it: nobody but a person may enable it then."""
+        return self.reason == _STOPPED
+
+    @property
     def is_busy(self) -> bool:
         """CRTK's flag: false, because servo commands do not count as busy."""
         return False
@@ -73,7 +79,7 @@ class OperatingStateMachine:
             the new reason where a cause forbids ENABLED.
         """
         if name == E_STOP:
-            self.fault('emergency stop')
+            self.fault(_STOPPED)
             return ''
         if name not in COMMANDS:
             known = ', '.join((*COMMANDS, E_STOP))

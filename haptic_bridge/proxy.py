@@ -52,11 +52,6 @@ class Touch:
         return bool(self._state['touching'][0])
 
     @property
-    def spread(self) -> float:
-        """Sum of the squared shares of the touched nodes: 1 on a node, a third between three."""
-        return float(self._state['spread'][0])
-
-    @property
     def depth(self) -> float:
         """Distance of device and proxy [m]."""
         return float(self._state['depth'][0])

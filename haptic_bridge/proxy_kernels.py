@@ -23,7 +23,6 @@ STATE = np.dtype(
         ('normal', 'f8', (3,)),
         ('nodes', 'i8', (3 * PATCHES,)),
         ('weights', 'f8', (3 * PATCHES,)),
-        ('spread', 'f8'),
         ('push', 'f8', (MOST_PUSHES,)),  # [m] part of the depth that a triangle holds
         ('push_normal', 'f8', (MOST_PUSHES, 3)),
         ('push_slot', 'i8', (MOST_PUSHES,)),
@@ -388,11 +387,6 @@ def _write_patches(surface: Geometry, state: np.ndarray) -> None:
             s.contact[axis] += push * near.closest[axis, slot]
     for i in range(3 * PATCHES):
         s.weights[i] /= total
-    s.spread = 0.0
-    for i in range(3 * PATCHES):
-        for j in range(3 * PATCHES):
-            if s.nodes[i] == s.nodes[j]:
-                s.spread += s.weights[i] * s.weights[j]
     for axis in range(3):
         s.contact[axis] /= total
         s.normal[axis] = (s.position[axis] - s.device[axis]) / s.depth

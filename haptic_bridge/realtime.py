@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from tissue_sim.ros import Stop
+from tissue_sim.lifecycle import Stop
 from tissue_sim.timing import PeriodicLoop, request_real_time
 
 PRIORITY = 40

@@ -1,6 +1,6 @@
 """The safety chain between the force law and the operator's hand: each link a small pure function.
 
-Order in `force_path`: gate of NaN and range, gate of the operating state, (force law), passivity
+Order in `force_path`: gate of NaN and range, (force law), gate of the operating state, passivity
 observer and controller, slew limit, clamp to the device profile, soft start. Two promises hold for
 every commanded force: its norm is at most max_force, and it differs from the last one by at most
 max_slew times the time between, also on its way to zero. The second has one exception: where the

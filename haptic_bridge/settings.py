@@ -9,7 +9,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from scipy.spatial.transform import Rotation
 
-from tissue_sim.scene_file import SceneModel, nearest
+from tissue_sim.scene_file import SceneModel, nearest, syntax_error
 from tissue_sim.share import share_folder
 
 Vector = tuple[float, float, float]
@@ -25,7 +25,7 @@ class ToolSettings(SceneModel):
 
     radius: float = Field(0.004, gt=0, le=0.05, description='[m] of the sphere that touches')
     coupling_stiffness: float = Field(
-        200.0, gt=0, le=10_000, description='[N/m] of the spring between device and proxy'
+        200.0, ge=1, le=10_000, description='[N/m] of the spring between device and proxy'
     )
     blade_root: Vector = Field(
         (0.0, 0.0, 0.02), description='[m] end of the cutting edge at the handle, tool frame'
@@ -132,7 +132,7 @@ class DeviceProfile(SceneModel):
         except ValidationError as error:
             raise SettingsError(f'{path}: {_first_problem(error, cls)}') from None
         except YAMLError as error:
-            raise SettingsError(f'{path} is not YAML: {" ".join(str(error).split())}') from None
+            raise SettingsError(syntax_error(path, error)) from None
 
 
 def _first_problem(error: ValidationError, model: type[BaseModel]) -> str:

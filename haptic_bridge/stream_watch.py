@@ -6,6 +6,10 @@ CLOCK_JUMP = 0.5
 """[s] by which stamps may move against the receiver's clock between two messages."""
 MEMORY = 1.0
 """[s] in which numbers that go back twice are those of two senders; once is a restart."""
+QUEUED = 3.0
+"""[s] for which messages of a network may come late before it is the clock that was set back."""
+FORGETTING = 0.01
+"""Share by which a message more late than before moves what counts as in time."""
 _NANOSECONDS = 1_000_000_000
 
 
@@ -20,10 +24,18 @@ class StreamWatch:
 
     Args:
         topic: for the sentences.
+        queues: its messages may come over a network, and wait in queues there: stamps that fall
+            back are late messages at first (`late`), and a clock that was set after `QUEUED` only.
+
+    Attributes:
+        late: the last message came more than `CLOCK_JUMP` later than is usual; use it for nothing.
     """
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, *, queues: bool = False) -> None:
+        self.late = False
         self._topic = topic
+        self._queues = queues
+        self._late_since: int | None = None
         self._number = 0
         self._went_back: int | None = None
         self._two_seen: int | None = None
@@ -71,13 +83,31 @@ class StreamWatch:
     def _compare(self, stamp_ns: int, now_ns: int) -> str:
         if stamp_ns == 0:
             return ''
-        before, self._offset = self._offset, stamp_ns - now_ns
-        if before is None:
+        offset = stamp_ns - now_ns
+        jump = 0.0 if self._offset is None else (offset - self._offset) / _NANOSECONDS
+        if self._queues and self._falls_behind(jump, now_ns):
             return ''
-        jump = (self._offset - before) / _NANOSECONDS
+        usual = self._offset
+        if self._queues and usual is not None and -CLOCK_JUMP <= jump < 0:
+            self._offset = usual + round(FORGETTING * (offset - usual))
+        else:
+            self._offset = offset
         if abs(jump) <= CLOCK_JUMP:
             return ''
         return (
             f'the stamps of {self._topic} jumped by {jump:+.3g} s: its clock was set, '
             'or its messages wait in a queue'
         )
+
+    def _falls_behind(self, jump: float, now_ns: int) -> bool:
+        """Whether a message is late, and not yet for so long that the clock must have been set."""
+        if jump >= -CLOCK_JUMP:
+            self.late, self._late_since = False, None
+            return False
+        self.late = True
+        if self._late_since is None:
+            self._late_since = now_ns
+        if now_ns - self._late_since <= QUEUED * _NANOSECONDS:
+            return True
+        self.late, self._late_since = False, None
+        return False

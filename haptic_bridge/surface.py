@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from tissue_sim.replica import FARTHEST
+
 LEAF = 4
 """Triangles of a leaf."""
-FARTHEST = 1e3
-"""[m] from the origin of the tissue frame that a node may be."""
 _BITS = 16
 """Of the Morton code along each axis."""
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from haptic_bridge.chain import INSIDE
-from haptic_bridge.surface import FARTHEST
 from haptic_bridge.wire import ForceSampleCodec, Sample
+from tissue_sim.refusals import MessageError
+from tissue_sim.replica import FARTHEST
 
 LARGEST_FORCE = 1e3
 """[N]. A simulation that diverges exceeds it long before it overflows."""
@@ -63,8 +64,8 @@ class TissueSample(NamedTuple):
         )
 
     @property
-    def problem(self) -> str:
-        """Why it cannot be believed, as a sentence; '' if it can."""
+    def problem(self) -> MessageError | None:
+        """Why it cannot be believed; None if it can."""
         for name, size, most, unit in (
             ('force', math.hypot(*self.force), LARGEST_FORCE, 'N'),
             ('stiffness', np.abs(self.stiffness).max(), LARGEST_STIFFNESS, 'N/m'),
@@ -74,8 +75,9 @@ class TissueSample(NamedTuple):
             ('topology', self.topology, _LARGEST_COUNT, ''),
         ):
             if not 0 <= size <= most:  # a NaN is not
-                return (
-                    f'the tissue force of frame {self.step} cannot be believed: its {name} is '
-                    f'{size:g} {unit}, not finite or not from 0 to {most:g} {unit}'
-                ).replace('  ', ' ')
-        return ''
+                text = (
+                    f'of frame {self.step} the {name} is {size:g} {unit}, not finite or not from '
+                    f'0 to {most:g} {unit}'
+                )
+                return MessageError(f'{name} that cannot be believed', ' '.join(text.split()))
+        return None

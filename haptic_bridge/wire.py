@@ -7,19 +7,31 @@ Limitations: little-endian plain CDR (what every RMW of Jazzy sends on the machi
 supports), and messages that consist of a `std_msgs/Header` followed by numbers.
 """
 
+import math
 import struct
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
+
+from tissue_sim.refusals import MessageError
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 _HEADER = struct.Struct('<4siII')
 _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 _NANOSECONDS = 1_000_000_000
 _LONGEST_PADDING_AT_END = 3
+LONGEST_FRAME = 255
+"""Bytes of a frame_id."""
+_REMEMBERED = 64
+"""Frames of which the bytes are not read again."""
+UNIT = 0.01
+"""By which the length of a unit quaternion may differ from 1."""
+_LAST_STATE = 2
+LARGEST = 1e6
+"""Of any number that is a quantity: a position in millimetres, a stiffness in N/m."""
 
 
-class WireError(ValueError):
+class WireError(MessageError):
     """Bytes that are not the message they were taken for, or values that do not fit into it."""
 
 
@@ -78,45 +90,76 @@ class StampedCodec:
             return head + self._packer.pack(self._frame, *values)
         except struct.error as error:
             raise WireError(
-                f'{self.name} takes {list(self.fields)} as flat numbers, got {values}: {error}'
+                'values that do not fit',
+                f'{self.name} takes {list(self.fields)} as flat numbers, got {values}: {error}',
             ) from None
 
     def decode(self, data: bytes) -> Sample:
         """The stamp, frame and numbers of a message in CDR bytes."""
         size = len(data)
         if size < _HEADER.size:
-            raise WireError(f'{self.name} cut short: {size} bytes are less than its header')
+            text = f'{self.name} cut short: {size} bytes are less than its header'
+            raise WireError('wrong length', text)
         encapsulation, seconds, nanoseconds, length = _HEADER.unpack_from(data)
         if encapsulation[:2] != _ENCAPSULATION[:2]:
             raise WireError(
+                'wrong encoding',
                 f'{self.name} is not little-endian plain CDR: it starts with '
-                f'{encapsulation.hex()}, not with {_ENCAPSULATION.hex()}'
+                f'{encapsulation.hex()}, not with {_ENCAPSULATION.hex()}',
             )
         body = self._bodies.get(length)
         if body is None:
             if not 0 < length <= size - _HEADER.size:
-                raise WireError(f'{self.name} gives its frame_id {length} bytes of {size} in all')
+                text = f'{self.name} gives its frame_id {length} bytes of {size} in all'
+                raise WireError('wrong length', text)
+            if length > LONGEST_FRAME + 1:
+                text = f'{self.name} has a frame_id of {length - 1} bytes: {LONGEST_FRAME} at most'
+                raise WireError('frame_id too long', text)
             body = self._bodies[length] = _body(self.layout, length)
         if not 0 <= size - _HEADER.size - body.size <= _LONGEST_PADDING_AT_END:
             raise WireError(
+                'wrong length',
                 f'{self.name} with a frame_id of {length - 1} bytes has '
-                f'{_HEADER.size + body.size} bytes, got {size}'
+                f'{_HEADER.size + body.size} bytes, got {size}',
             )
         frame, *values = body.unpack_from(data, _HEADER.size)
         name = self._frames.get(frame)
         if name is None:
+            if len(self._frames) >= _REMEMBERED:
+                self._frames.clear()
             name = self._frames[frame] = self._frame_name(frame)
         return Sample(seconds * _NANOSECONDS + nanoseconds, name, tuple(values))
 
+    def believed(self, data: bytes) -> Sample:
+        """As `decode`, for whoever has no better judgement of what the numbers may be.
+
+        Raises:
+            MessageError: it cannot be decoded, a quantity is not finite or beyond `LARGEST`, an
+                orientation is no unit quaternion, or a contact state does not exist.
+        """
+        sample = self.decode(data)
+        values = sample.values
+        for name, code, _ in self.layout:
+            at = self.fields[name]
+            if code == 'd' and not all(abs(value) <= LARGEST for value in values[at]):
+                text = f'{name} of {self.name} is {values[at]}'
+                raise MessageError('not finite or too far', text)
+            if name == 'orientation' and abs(math.hypot(*values[at]) - 1) > UNIT:
+                text = f'its length is {math.hypot(*values[at]):.3g}, it must be 1'
+                raise MessageError('orientation that is no unit quaternion', text)
+            if name == 'state' and values[at][0] > _LAST_STATE:
+                raise MessageError('no such state', f'state {values[at][0]} of {self.name}')
+        return sample
+
     def _frame_name(self, frame: bytes) -> str:
         if frame[-1:] != b'\0':
-            raise WireError(
-                f'{self.name} has a frame_id that does not end with a zero byte: {frame!r}'
-            )
+            text = f'{self.name} has a frame_id that does not end with a zero byte: {frame!r}'
+            raise WireError('frame_id that is no text', text)
         try:
             return frame[:-1].decode()
         except UnicodeDecodeError:
-            raise WireError(f'{self.name} has a frame_id that is not UTF-8: {frame!r}') from None
+            text = f'{self.name} has a frame_id that is not UTF-8: {frame!r}'
+            raise WireError('frame_id that is no text', text) from None
 
 
 @lru_cache(maxsize=256)

@@ -8,8 +8,6 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import typer.main
-
 from session.scene import SCENES
 
 Shell = Literal['bash', 'zsh']
@@ -35,27 +33,23 @@ complete -o default -F _trainer trainer ./trainer
 """
 
 
-def script(app: Any, shell: Shell) -> str:
+def script(program: Any, shell: Shell) -> str:
     """The script for a shell.
 
     Args:
-        app: the command line.
+        program: click's group of all commands.
         shell: zsh reads bash's script by its own `bashcompinit`.
     """
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    hints = {
-        entry.name or entry.callback.__name__.replace('_', '-'): typing.get_type_hints(
-            entry.callback
-        )
-        for entry in app.registered_commands
-    }
+    commands = program.commands
     options: list[str] = []
     values: list[str] = []
     for name, command in commands.items():
+        hints = typing.get_type_hints(command.callback)
         words = ['--help']
         for parameter in command.params:
-            words += [option for option in parameter.opts if option.startswith('--')]
-            known = _known(parameter.name, hints[name])
+            spelt = [*parameter.opts, *parameter.secondary_opts]  # --push, --no-push
+            words += [option for option in spelt if option.startswith('--')]
+            known = _known(parameter.name, hints)
             for before in parameter.opts if known else ():
                 # an argument is asked for right after the command
                 before = before if before.startswith('-') else name

@@ -1,6 +1,8 @@
 """A whole session: the nodes, the bag, the table, the verdict."""
 
 import json
+import socket
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,7 +30,7 @@ from session.judge import Expected, judge
 from session.node_process import NodeCommand
 from session.processes import Outcome, Supervisor
 from session.progress import SessionProgress
-from session.report import session_tables
+from session.recordings.report import session_tables
 from session.scene import Scene, load_scene
 from session.status import Status
 from session.summary import Summary, summarise
@@ -71,14 +73,27 @@ def run_demo(options: DemoOptions) -> Status:
         SessionError, SceneError, SettingsError: it cannot be run like this.
     """
     scene = load_scene(options.scene)
-    seconds = _duration(scene, options.seconds)
+    seconds = script_seconds(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)
     nodes = session_nodes(scene.path, bag, options.seed, seconds)
     if options.view:
-        nodes.insert(0, viewer_command(scene.path, LOCAL, PORT, session=False))
-    console, notes = Console(), Console(stderr=True)
+        nodes.insert(0, viewer_command(scene.path, LOCAL, page_port(), session=False))
+    notes = Console(stderr=True)
     with reserved_domain(options.domain) as domain:
-        outcome = _run(nodes, seconds, bag, domain, notes)
+        outcome = run_nodes(nodes, seconds, bag, node_environment(domain), notes)
+    return conclude(outcome, bag, expected_of(scene), as_json=options.as_json)
+
+
+def conclude(outcome: Outcome, bag: Path, expected: Expected, *, as_json: bool) -> Status:
+    """Prints what became of a session.
+
+    Args:
+        outcome: of its processes.
+        bag: that it was recorded into.
+        expected: by its scene.
+        as_json: print the summary as JSON.
+    """
+    console, notes = Console(), Console(stderr=True)
     if outcome.interrupted and not outcome.deaths:
         notes.print(f'interrupted (exit status {int(Status.INTERRUPTED)})', highlight=False)
     if not outcome.ran:
@@ -89,8 +104,8 @@ def run_demo(options: DemoOptions) -> Status:
     except BagError as error:
         notes.print(f'[bold red]no summary:[/] {escape(str(error))}')
         return _status(outcome, ['no summary'])
-    failures = judge(summary, outcome, expected_of(scene))
-    if options.as_json:
+    failures = judge(summary, outcome, expected)
+    if as_json:
         _print_json(summary, outcome, failures, console)
     else:
         console.print(session_tables(summary))
@@ -109,7 +124,16 @@ def expected_of(scene: Scene) -> Expected:
     return Expected(rates, cut=scene.arm.script.cuts)
 
 
-def _duration(scene: Scene, asked: float | None) -> float:
+def page_port() -> int:
+    """The usual one; where another page has it 0, which is one that is free."""
+    try:
+        with socket.create_server((LOCAL, PORT)):
+            return PORT
+    except OSError:
+        return 0
+
+
+def script_seconds(scene: Scene, asked: float | None) -> float:
     """Of the arm's script [s], refused where the hand would have to be too fast."""
     seconds = asked
     if seconds is None:
@@ -140,12 +164,8 @@ def new_bag(asked: Path | None, scene: str) -> Path:
         folder = asked.resolve()
         if folder.parent.exists() and not folder.parent.is_dir():
             raise SessionError(f'{folder.parent} is a file: name a folder that the bag can go into')
-        if not folder.parent.exists():
-            raise SessionError(
-                f'{folder.parent} does not exist: make it first, the bag goes into it'
-            )
     try:
-        folder.mkdir(parents=asked is None)
+        folder.mkdir(parents=True)
         folder.rmdir()
     except FileExistsError:
         raise SessionError(f'{folder} exists already: name a new folder for the bag') from None
@@ -157,13 +177,28 @@ def new_bag(asked: Path | None, scene: str) -> Path:
     return folder.resolve()
 
 
-def _run(
-    nodes: list[NodeCommand], seconds: float, bag: Path, domain: int, notes: Console
+def run_nodes(
+    nodes: list[NodeCommand],
+    seconds: float,
+    bag: Path,
+    environment: Mapping[str, str],
+    notes: Console,
+    *,
+    restart: bool = False,
 ) -> Outcome:
-    environment = node_environment(domain)
+    """Runs the nodes of a session until the arm's script is over.
+
+    Args:
+        nodes: to run.
+        seconds: duration of the script [s].
+        bag: folder of the bag; gets the nodes' logs.
+        environment: of the nodes.
+        notes: where the progress is shown.
+        restart: start nodes that die again.
+    """
     with (
         SessionProgress(notes, len(nodes)) as progress,
-        Supervisor(nodes, bag / 'log', environment, progress.tell) as supervisor,
+        Supervisor(nodes, bag / 'log', environment, progress.tell, restart=restart) as supervisor,
     ):
         if supervisor.start():
             supervisor.run(

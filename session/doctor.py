@@ -169,7 +169,8 @@ def set_up(folder: Path, jazzy: str | None, *, ready: bool, needed: int) -> Find
         remedy = f'make room: setting up takes {needed / 1e9:g} GB'
         return Finding('set-up', 'error', f'{free / 1e9:.1f} GB free in {there}', remedy)
     remedy = 'run `./trainer setup`; every command does it when it is due'
-    return Finding('set-up', 'warning', f'not made yet, or of other sources, {ros}', remedy)
+    what = f'not made, not finished, or of other sources, {ros}'
+    return Finding('set-up', 'warning', what, remedy)
 
 
 def dds(python: str | None, environ: Mapping[str, str]) -> Finding:

@@ -21,8 +21,17 @@ MODULES = {
     RECORDER_NODE: 'bags.node',
     VIEWER_NODE: 'viewer.node',
 }
+SIM_SIDE = (TISSUE_NODE, CUTTING_NODE)
+"""What may run on another host than the device."""
 SIMULATION = (ARM_NODE, BRIDGE_NODE, TISSUE_NODE, CUTTING_NODE)
 """The nodes of a session, without who only listens."""
+AGAIN: dict[str, dict[str, object]] = {
+    BRIDGE_NODE: {'auto_enable': False},
+    TISSUE_NODE: {'resume': True},
+    RECORDER_NODE: {'resume': True},
+}
+"""Parameters of nodes that take the place of one that died: no force without a command, the tissue
+as it was, a bag beside the one that was cut off."""
 CLOSING_A_BAG = 20.0  # [s]
 LOCAL, PORT = '127.0.0.1', 8080
 """Where the page is served unless the user says else."""
@@ -47,16 +56,56 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
     return [*commands, recorder_command(scene, bag, seed)]
 
 
-def simulation_nodes(scene: Path, seed: int) -> list[NodeCommand]:
+def simulation_nodes(scene: Path, seed: int, checkpoint: Path) -> list[NodeCommand]:
     """Commands for a session that waits for its operator: the hand has no script, no force is on.
 
     Args:
         scene: file that all of them read.
         seed: of everything random.
+        checkpoint: file in which the tissue is kept.
     """
     common = {'scene': str(scene), 'seed': seed}
-    own = {ARM_NODE: {'guided': True}}
+    own: dict[str, dict[str, object]] = {
+        ARM_NODE: {'guided': True},
+        TISSUE_NODE: {'checkpoint': str(checkpoint)},
+    }
     return [node_command(name, common | own.get(name, {})) for name in SIMULATION]
+
+
+def bridge_side_nodes(
+    scene: Path, bag: Path, seed: int, seconds: float, *, arm: bool
+) -> list[NodeCommand]:
+    """Commands for the host with the device: the bridge, the recorder, and an arm if none is there.
+
+    Args:
+        scene: file that all of them read.
+        bag: folder of the new bag.
+        seed: of everything random.
+        seconds: duration of the arm's script [s].
+        arm: whether the emulated arm takes the place of a device; else the bridge waits for an
+            operator who enables it.
+    """
+    nodes = session_nodes(scene, bag, seed, seconds)
+    if not arm:
+        nodes = [n for n in nodes if n.name not in (ARM_NODE, BRIDGE_NODE)]
+        nodes.insert(0, node_command(BRIDGE_NODE, {'scene': str(scene), 'seed': seed}))
+    return [node for node in nodes if node.name not in SIM_SIDE]
+
+
+def sim_side_nodes(
+    scene: Path, seed: int, checkpoint: Path, mesh_bandwidth: float
+) -> list[NodeCommand]:
+    """Commands for the host that computes the tissue.
+
+    Args:
+        scene: file that both sides read.
+        seed: of everything random.
+        checkpoint: file in which the tissue is kept.
+        mesh_bandwidth: most that goes out for meshes [bytes/s]; 0: no limit.
+    """
+    common: dict[str, object] = {'scene': str(scene), 'seed': seed}
+    kept = {'checkpoint': str(checkpoint), 'mesh_bandwidth': mesh_bandwidth}
+    return [node_command(TISSUE_NODE, common | kept), node_command(CUTTING_NODE, common)]
 
 
 def viewer_command(scene: Path, host: str, port: int, *, session: bool) -> NodeCommand:
@@ -82,20 +131,24 @@ def node_command(
         remapped: topics and services by the names that the node's code gives them.
     """
     renamed = [f'{before}:={after}' for before, after in (remapped or {}).items()]
-    argv = _argv(MODULES[name], parameters) + tuple(x for rule in renamed for x in ('-r', rule))
-    return NodeCommand(name, argv)
+    remaps = tuple(word for rule in renamed for word in ('-r', rule))
+    argv = _argv(MODULES[name], parameters) + remaps
+    return NodeCommand(name, argv, again=_parameters(AGAIN.get(name, {})))
 
 
-def recorder_command(scene: Path | None, bag: Path, seed: int) -> NodeCommand:
+def recorder_command(
+    scene: Path | None, bag: Path, seed: int, parameters: Mapping[str, object] | None = None
+) -> NodeCommand:
     """The recorder, which is ended last and has time to close its bag.
 
     Args:
         scene: file of which the text goes into the bag; None: not known.
         bag: folder of the new bag.
         seed: goes into the bag.
+        parameters: others of the node, by name.
     """
-    parameters = {'scene': str(scene or ''), 'seed': seed, 'bag': str(bag)}
-    command = node_command(RECORDER_NODE, parameters)
+    own = {'scene': str(scene or ''), 'seed': seed, 'bag': str(bag)}
+    command = node_command(RECORDER_NODE, own | dict(parameters or {}))
     return replace(command, records=True, grace=CLOSING_A_BAG)
 
 
@@ -108,12 +161,14 @@ def discovery(environ: Mapping[str, str]) -> dict[str, str]:
     Args:
         environ: of the shell.
     """
+    folder = share_folder() / 'config' / 'dds'
+    local, network = (str(folder / f'{name}.xml') for name in ('localhost', 'network'))
     given = environ.get(RANGE, 'LOCALHOST')
-    profile = 'localhost' if given == 'LOCALHOST' else 'network'
-    path = str(share_folder() / 'config' / 'dds' / f'{profile}.xml')
-    if environ.get(PROFILES, path) != path:
+    if environ.get(PROFILES, local) not in (local, network):
         return {RANGE: given, PROFILES: environ[PROFILES]}
-    return {RANGE: 'SYSTEM_DEFAULT' if given == 'LOCALHOST' else given, PROFILES: path}
+    if given == 'LOCALHOST' or (given, environ.get(PROFILES)) == ('SYSTEM_DEFAULT', local):
+        return {RANGE: 'SYSTEM_DEFAULT', PROFILES: local}  # the latter: within `trainer run`
+    return {RANGE: given, PROFILES: network}
 
 
 def arm_command(scene: Path, **parameters: object) -> NodeCommand:
@@ -125,9 +180,13 @@ def arm_command(scene: Path, **parameters: object) -> NodeCommand:
 def _argv(module: str, parameters: Mapping[str, object]) -> tuple[str, ...]:
     # What a node says goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
     argv = [sys.executable, '-m', module, '--ros-args', '--disable-external-lib-logs']
-    for key, value in parameters.items():
-        argv += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False)}']
-    return tuple(argv)
+    return (*argv, *_parameters(parameters))
+
+
+def _parameters(values: Mapping[str, object]) -> tuple[str, ...]:
+    # Of a parameter that is given twice, the last one holds.
+    given = [f'{key}:={json.dumps(value, ensure_ascii=False)}' for key, value in values.items()]
+    return tuple(word for text in given for word in ('-p', text))
 
 
 def node_environment(domain: int) -> dict[str, str]:

@@ -209,8 +209,6 @@ class InProcess:
         contact = tool_contact(values) if values is not None else None
         frame = self.tissue.frame(contact)
         self.frame = frame
-        if frame.diverged:
-            return
         surface = self._surface_now()
         sequence = contact.sequence if contact is not None else 0
         self._down.send(self.ticks, (surface, self._sample_of(frame, sequence, stamp)))

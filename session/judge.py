@@ -40,9 +40,7 @@ def judge(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
         Sentences; none if all is well. An interrupted session need not have got anywhere.
     """
     return [
-        *(death.sentence for death in outcome.deaths),
-        *(f'{name} had to be killed at the end' for name in outcome.killed),
-        *outcome.failures,
+        *outcome.troubles,
         *_bag(summary),
         *_errors(summary),
         *([] if outcome.interrupted else _rates(summary, outcome, expected)),

@@ -10,10 +10,14 @@ from typing import Any, Self
 
 
 class Keys:
-    """Reads keys as they are pressed; a context manager. Where there is no terminal, none come."""
+    """Reads keys as they are pressed; a context manager. Where there is no terminal, none come.
+
+    Nor do they where the terminal belongs to another program: the system would stop this one.
+    """
 
     def __init__(self) -> None:
-        self._file = sys.stdin.fileno() if sys.stdin and sys.stdin.isatty() else -1
+        file = sys.stdin.fileno() if sys.stdin and sys.stdin.isatty() else -1
+        self._file = -1 if file < 0 or _of_another(file) else file
         self._before: list[Any] = []
 
     def __enter__(self) -> Self:
@@ -36,3 +40,11 @@ class Keys:
         if self._file < 0 or not select.select([self._file], [], [], 0.0)[0]:
             return ''
         return os.read(self._file, 64).decode(errors='replace')
+
+
+def _of_another(terminal: int) -> bool:
+    """Whether this process runs in the background of its terminal."""
+    try:
+        return os.tcgetpgrp(terminal) != os.getpgrp()
+    except OSError:  # it is not the one that this process was started from
+        return False

@@ -13,7 +13,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from session.graph import ARM_NODE, BRIDGE_NODE, RECORDER_NODE, discovery
+from session.graph import ARM_NODE, BRIDGE_NODE, RECORDER_NODE, VIEWER_NODE, discovery
 
 PACKAGE = 'cutting_trainer'
 ARGUMENTS: dict[str, tuple[Any, str]] = {
@@ -25,17 +25,24 @@ ARGUMENTS: dict[str, tuple[Any, str]] = {
     'auto_enable': ('true', 'whether the bridge enables itself and the arm'),
     'bag': ('session', 'new folder for the bag'),
     'namespace': ('', 'of all nodes and topics, for more than one trainer in a graph'),
+    'host': ('127.0.0.1', 'address that the page is served on; 0.0.0.0: open to other machines'),
+    'port': ('8080', 'port of the page'),
     'arm': ('arm', 'namespace of the device, as in /MTML for /MTML/measured_cp'),
 }
-TYPES = {'scene': str, 'seed': int, 'seconds': float, 'auto_enable': bool, 'bag': str}
-OWN = {
-    ARM_NODE: ('seconds',),
-    BRIDGE_NODE: ('auto_enable',),
-    RECORDER_NODE: ('bag',),
+TYPES = {
+    **{'scene': str, 'seed': int, 'seconds': float, 'auto_enable': bool, 'bag': str},
+    **{'host': str, 'port': int},
 }
-"""Parameters of a node beside scene and seed."""
+USUAL = ('scene', 'seed')
+PARAMETERS = {
+    ARM_NODE: (*USUAL, 'seconds'),
+    BRIDGE_NODE: (*USUAL, 'auto_enable'),
+    RECORDER_NODE: (*USUAL, 'bag'),
+    VIEWER_NODE: ('scene', 'host', 'port'),
+}
+"""Of the nodes that have others than `USUAL`."""
 OF_DEVICE = ('measured_cp', 'measured_cv', 'servo_cf', 'button')
-"""Topics by which a bridge and a device know each other."""
+"""Topics by which bridge, viewer and device know each other."""
 
 
 def declared(*names: str, **defaults: str) -> list[Any]:
@@ -65,7 +72,7 @@ def nodes(
         names: of them, which are those of their executables too.
         namespace: theirs; None: that of the argument `namespace`.
         arguments: names of launch arguments that stand for others, as `left_scene` for `scene`.
-        device: namespace that the bridge finds its device in; None: `arm`, below its own.
+        device: namespace that they find the device in; None: `arm`, below their own.
     """
     where = LaunchConfiguration('namespace') if namespace is None else namespace
     called = arguments or {}
@@ -77,13 +84,13 @@ def nodes(
             name=name,
             namespace=where,
             output='screen',
-            remappings=remapped if device is not None and name == BRIDGE_NODE else [],
+            remappings=remapped if device is not None else [],
             parameters=[
                 {
                     key: ParameterValue(
                         LaunchConfiguration(called.get(key, key)), value_type=TYPES[key]
                     )
-                    for key in ('scene', 'seed', *OWN.get(name, ()))
+                    for key in PARAMETERS.get(name, USUAL)
                 }
             ],
         )

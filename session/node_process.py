@@ -28,6 +28,7 @@ class NodeCommand:
             asked to end, not killed, when the launcher dies or the user is in a hurry.
         converses: it asks for things by lines `message: ...`, and reads answers on standard input.
         grace: [s] that it has to end after SIGINT, and half of it again after SIGTERM.
+        again: further arguments for a start in the place of one that died.
     """
 
     name: str
@@ -35,17 +36,28 @@ class NodeCommand:
     records: bool = False
     converses: bool = False
     grace: float = 5.0
+    again: tuple[str, ...] = ()
 
 
 class _Log:
-    """Lines of one node, kept until the folder that they belong into exists: its owner makes it."""
+    """Lines of one node, kept until the folder that they belong into exists: its owner makes it.
+
+    A line that comes again and again is written once, with how often: a library that complains of
+    each message writes as many as come.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._waiting: list[str] = []
         self._file: BinaryIO | None = None
+        self._last, self._again = '', 0
 
     def write(self, line: str) -> None:
+        if line == self._last:
+            self._again += 1
+            return
+        self._tell_again()
+        self._last = line
         self._waiting.append(line)
         if self._path.parent.parent.is_dir():
             self.flush()
@@ -62,7 +74,13 @@ class _Log:
                 self._file.write(''.join(f'{line}\n' for line in self._waiting).encode())
             self._waiting.clear()
 
+    def _tell_again(self) -> None:
+        if self._again:
+            self._waiting.append(f'(the same {self._again} times more)')
+            self._again = 0
+
     def close(self) -> None:
+        self._tell_again()
         self.flush()
         if self._file is not None:
             self._file.close()

@@ -3,12 +3,14 @@
 import selectors
 import signal
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from session.node_process import NodeCommand, NodeProcess, is_warning
+from session.restarts import Backoff
 
 STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 POLL = 0.05  # [s]
@@ -74,6 +76,16 @@ class Outcome:
     killed: list[str] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
 
+    @property
+    def kills(self) -> list[str]:
+        """`killed`, as sentences."""
+        return [f'{name} had to be killed at the end' for name in self.killed]
+
+    @property
+    def troubles(self) -> list[str]:
+        """Deaths, kills and failures, as sentences."""
+        return [*(death.sentence for death in self.deaths), *self.kills, *self.failures]
+
 
 class Supervisor:
     """Runs a set of nodes to the end of a session; use it as a context manager.
@@ -88,6 +100,7 @@ class Supervisor:
         log_folder: gets one file a node as soon as the folder above it exists.
         environment: of every node.
         tell: is called with what happens.
+        restart: start nodes that die again, with `NodeCommand.again`.
     """
 
     def __init__(
@@ -96,6 +109,8 @@ class Supervisor:
         log_folder: Path,
         environment: Mapping[str, str],
         tell: Callable[[Event], None] = lambda event: None,
+        *,
+        restart: bool = False,
     ) -> None:
         self.outcome = Outcome()
         self._commands = commands
@@ -107,6 +122,7 @@ class Supervisor:
         self._interrupts = 0
         self._began: float | None = None
         self._handlers: dict[int, object] = {}
+        self._backoffs: defaultdict[str, Backoff] | None = defaultdict(Backoff) if restart else None
 
     def __enter__(self) -> 'Supervisor':
         for number in STOPPING_SIGNALS:
@@ -166,6 +182,11 @@ class Supervisor:
             if (node := self._nodes.pop(name, None)) is not None:
                 self._close(node)
 
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Sends a signal to a node that lives; what becomes of it is an accident, as any."""
+        if name in self.pids:
+            self._nodes[name].send(number)
+
     def answer(self, name: str, text: str) -> None:
         """Writes a line to a node that converses."""
         if name in self.pids:
@@ -194,14 +215,16 @@ class Supervisor:
         Args:
             seconds: [s] that it lasts at most.
             until_done: the node whose line `done: NAME` ends it.
-            tick: is called often with the elapsed time [s].
+            tick: is called often with the elapsed time [s]; the session is over when it is False.
         """
         assert self._began is not None, 'start() first'
         elapsed = 0.0
-        while not self._interrupts and elapsed < seconds and self.pids:
+        while not self._interrupts and elapsed < seconds and (self.pids or self._backoffs):
             self._poll(min(POLL, seconds - elapsed))
+            self._start_again()
             elapsed = time.monotonic() - self._began
-            tick(elapsed)
+            if tick(elapsed) is False:
+                break
             if until_done in self._nodes and self._nodes[until_done].done:
                 self.outcome.finished = True
                 break
@@ -226,6 +249,16 @@ class Supervisor:
 
     def _on_signal(self, number: int, frame: object) -> None:
         self._interrupts += 1
+
+    def _start_again(self) -> None:
+        """Starts what died, once it is time; a node that comes back never brings force with it."""
+        for name, backoff in (self._backoffs or {}).items():
+            if backoff.due is not None and time.monotonic() >= backoff.due:
+                backoff.started(time.monotonic())
+                command = next((c for c in self._commands if c.name == name), None)
+                if command is not None:
+                    self._close(self._nodes.pop(name))
+                    self._start(replace(command, argv=command.argv + command.again))
 
     def _start(self, command: NodeCommand) -> None:
         node = NodeProcess(command, self._logs / f'{command.name}.log', self._environment)
@@ -301,6 +334,9 @@ class Supervisor:
         self.outcome.deaths.append(death)
         others = ', '.join(self.pids)
         goes_on = f'; {others} go on' if others and elapsed is not None else ''
+        if self._backoffs is not None and elapsed is not None:
+            delay = self._backoffs[node.name].died(time.monotonic())
+            goes_on += f'; started again in {delay:g} s'
         self._tell(Event('died', node.name, death.sentence + goes_on))
 
     def _end(self, nodes: Iterable[NodeProcess], patience: int) -> None:
@@ -348,4 +384,5 @@ def _unready(waiting: Sequence[NodeProcess], timeout: float) -> str:
         f'{node.name} said last: {" / ".join(node.tail) or "nothing"}' for node in waiting
     )
     names = ' and '.join(node.name for node in waiting)
-    return f'{names} not ready within {timeout:g} s; {said}'
+    hint = 'does the machine do something else? ./trainer doctor'
+    return f'{names} not ready within {timeout:g} s ({hint}); {said}'

@@ -1,24 +1,38 @@
-"""The recorder alone, for a graph that somebody else has started."""
+"""`trainer record`: the recorder alone, for a graph that somebody else has started."""
 
-import os
-import sys
+import json
+import time
 from pathlib import Path
+from typing import Any
 
-from session.demo import new_bag
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from session.demo import new_bag, not_run
 from session.domain import parse_domain
 from session.errors import SessionError
 from session.graph import RECORDER_NODE, node_environment, recorder_command
+from session.node_process import NodeCommand
+from session.processes import Event, Outcome, Supervisor
 from session.scene import load_scene
+from session.status import Status
+
+_FOREVER = 1e9
+_COLUMNS = ('received', 'written', 'lost', 'unheard')
 
 
-def run_recorder(output: Path | None, scene: str, seed: int, domain: str) -> None:
-    """Becomes the recorder, which ends by Ctrl-C and says what it has; does not return.
+def run_recorder(
+    output: Path | None, scene: str, seed: int, domain: str, *, as_json: bool = False
+) -> Status:
+    """Records until Ctrl-C and says what became of the messages, topic by topic.
 
     Args:
         output: folder of the new bag; None: one named after scene and time.
         scene: name or path of the scene that the nodes run; empty: not known.
         seed: of the session.
         domain: ROS domain; empty: of the environment.
+        as_json: print the account as JSON.
 
     Raises:
         SessionError, SceneError: it cannot be recorded like this.
@@ -30,6 +44,63 @@ def run_recorder(output: Path | None, scene: str, seed: int, domain: str) -> Non
         raise SessionError('--output names no folder: give the path of a new one')
     path = load_scene(scene).path if scene else None
     bag = new_bag(output, path.stem if path else RECORDER_NODE)
-    command = recorder_command(path, bag, seed)
-    sys.stdout.flush()
-    os.execvpe(command.argv[0], command.argv, node_environment(number))
+    notes = Console(stderr=True, soft_wrap=True)
+    command = recorder_command(path, bag, seed, {'account_as_json': True})
+    outcome, account = _run(command, bag, number, notes)
+    if not outcome.ran:
+        return not_run(outcome, bag, notes)
+    if as_json:
+        print(json.dumps(account, indent=2))
+    elif account:
+        Console().print(account_table(account))
+    for failure in outcome.failures:
+        notes.print(f'[bold red]not as it should be:[/] {escape(failure)}', highlight=False)
+    if outcome.deaths:
+        return Status.NODE_DIED
+    return Status.FAILED if outcome.failures else Status.OK
+
+
+def _run(
+    command: NodeCommand, bag: Path, domain: int, notes: Console
+) -> tuple[Outcome, dict[str, Any]]:
+    """How the recorder ended, and its account, empty where it could not give one."""
+    account: dict[str, Any] = {}
+    began = time.monotonic()
+
+    def tell(event: Event) -> None:
+        if event.kind == 'message':
+            message = json.loads(event.text)
+            account.update(message if 'bag' in message else {})
+            account.setdefault('topics', {}).update({} if 'bag' in message else message)
+        elif event.kind == 'ready':
+            notes.print(f'recording into {escape(str(bag))}; Ctrl-C ends it', highlight=False)
+        elif event.kind != 'ending':
+            notes.print(escape(event.text), highlight=False)
+
+    def tick(_: float) -> None:
+        size = sum(file.stat().st_size for file in bag.glob('*.mcap'))
+        status.update(f'{time.monotonic() - began:.0f} s, {size / 1e6:.1f} MB')
+
+    with (
+        notes.status('starting') as status,
+        Supervisor([command], bag / 'log', node_environment(domain), tell) as supervisor,
+    ):
+        if supervisor.start():
+            supervisor.run(_FOREVER, tick=tick)
+        return supervisor.end(), account
+
+
+def account_table(account: dict[str, Any]) -> Table:
+    """What became of the messages of each topic, and which topics were not recorded."""
+    table = Table(title=f'{escape(account["bag"])}, {account["bytes"] / 1e6:.1f} MB')
+    table.add_column('topic', overflow='fold')
+    for word in _COLUMNS:
+        table.add_column('before it was heard' if word == 'unheard' else word, justify='right')
+    for topic, counts in account['topics'].items():
+        table.add_row(escape(topic), *(str(counts[word]) for word in _COLUMNS))
+    sums = [sum(counts[word] for counts in account['topics'].values()) for word in _COLUMNS]
+    table.add_section()
+    table.add_row('all', *map(str, sums))
+    for topic, reason in account['not_recorded'].items():
+        table.add_row(escape(f'{topic}: not recorded: {reason}'))
+    return table

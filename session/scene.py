@@ -11,6 +11,7 @@ from haptic_bridge.settings import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
+    SettingsError,
     ToolSettings,
     check_together,
 )
@@ -70,8 +71,11 @@ def load_scene(scene: str) -> Scene:
     tool = read_section(path, 'tool', ToolSettings)
     device = read_section(path, 'device', DeviceSettings)
     haptics = read_section(path, 'haptics', HapticsSettings)
-    profile = device.load_profile()
-    check_together(tool, device, haptics, profile)
+    try:
+        profile = device.load_profile()
+        check_together(tool, device, haptics, profile)
+    except SettingsError as error:
+        raise SettingsError(f'{path}: {error}') from None
     return Scene(
         name=path.stem,
         path=path,

@@ -153,9 +153,15 @@ TOPICS = (
 
 SERVICES = (
     (ros.GET_MESH, f'{OURS}/srv/GetMesh', TISSUE, 'the whole tissue now'),
+    *(
+        (name, f'{OURS}/srv/GetMesh', name.partition('/')[0], 'the tissue as this node knows it')
+        for name in ros.MESH_KEEPERS
+    ),
     (ros.CUT, f'{OURS}/srv/Cut', 'cutting', 'sweep the blade; `tissue_sim` calls it'),
     (f'{ros.ARM}/operating_state', f'{OURS}/srv/TriggerOperatingState', 'arm', 'CRTK state'),
     (f'{BRIDGE}/operating_state', f'{OURS}/srv/TriggerOperatingState', BRIDGE, 'CRTK state'),
+    ('NODE/change_state', 'lifecycle_msgs/srv/ChangeState', 'every node', 'its life cycle'),
+    ('NODE/get_state', 'lifecycle_msgs/srv/GetState', 'every node', 'where in it the node is'),
 )
 
 

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from session.changed_scene import write_changed
 from session.demo import new_bag, not_run
 from session.domain import reserved_domain
 from session.errors import SessionError
@@ -24,6 +23,7 @@ from session.graph import (
 from session.node_process import NodeCommand
 from session.processes import Event, Outcome, Supervisor
 from session.progress import SessionProgress
+from session.recordings.changed_scene import write_changed
 from session.scene import Scene, load_scene
 from session.status import Status
 from tissue_sim.errors import MeshError, SceneError
@@ -73,7 +73,11 @@ def run_view(options: ViewOptions) -> Status:
         with (
             SessionProgress(notes, len(nodes)) as progress,
             Supervisor(
-                nodes, Path(temporary) / 'log', node_environment(domain), session.tell(progress)
+                nodes,
+                Path(temporary) / 'log',
+                node_environment(domain),
+                session.tell(progress),
+                restart=True,
             ) as supervisor,
         ):
             if supervisor.start():
@@ -113,19 +117,22 @@ class _Session:
 
     def __init__(self, scene: Scene, options: ViewOptions, folder: Path) -> None:
         self._scene, self._options, self._folder = scene, options, folder
-        self._name, self._file = options.scene, scene.path
+        self._sources = {scene.name: options.scene}  # that the name alone may not lead to
+        self._file = scene.path
         self._method: str = scene.cutting.method
         self._recording: Path | None = None
-        self._asked: list[dict[str, Any]] = [{'ask': 'state'}]
+        self._asked: list[dict[str, Any]] = []
 
     def nodes(self) -> list[NodeCommand]:
         """Those that are started again together."""
-        return simulation_nodes(self._file, self._options.seed)
+        return simulation_nodes(self._file, self._options.seed, self._folder / 'tissue.checkpoint')
 
     def tell(self, progress: SessionProgress) -> Callable[[Event], None]:
         """What is to be called with the supervisor's events."""
 
         def tell(event: Event) -> None:
+            if event.kind == 'ready' and event.node == VIEWER_NODE:
+                self._asked.append({'ask': 'state'})
             if event.kind == 'message':
                 message = json.loads(event.text)
                 if 'ask' in message:
@@ -149,7 +156,9 @@ class _Session:
     def _do(self, request: dict[str, Any], supervisor: Supervisor) -> None:
         if request['ask'] == 'restart':
             self._restart(
-                request.get('scene', self._name), request.get('method', self._method), supervisor
+                request.get('scene', self._scene.name),
+                request.get('method', self._method),
+                supervisor,
             )
         elif request['ask'] == 'record' and request['on'] != bool(self._recording):
             self._record(request['on'], supervisor)
@@ -171,7 +180,7 @@ class _Session:
 
     def _restart(self, name: str, method: str, supervisor: Supervisor) -> None:
         """Begins anew: a bag holds one tissue, so that one is ended, and another begun."""
-        scene = load_scene(self._options.scene if name == self._scene.name else name)
+        scene = load_scene(self._sources.get(name, name))
         changes = {} if method == scene.cutting.method else {'cutting.method': method}
         if scene.name != self._scene.name and method == self._method:
             changes, method = {}, scene.cutting.method  # another scene comes with its own method
@@ -180,7 +189,7 @@ class _Session:
         if recorded:
             supervisor.remove([RECORDER_NODE])
             self._recording = None
-        self._scene, self._name, self._method = scene, name, method
+        self._scene, self._method = scene, method
         self._file = write_changed(scene, self._folder, changes) if changes else scene.path
         if not supervisor.replace(self.nodes()):
             outcome = supervisor.outcome

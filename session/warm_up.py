@@ -10,9 +10,9 @@ from cutting.settings import CuttingSettings
 from cutting.warm_up import warm_up as warm_up_cutting
 from haptic_bridge.arm import EmulatedArm
 from haptic_bridge.arm_settings import ArmSettings
-from haptic_bridge.force_path import warm_up as warm_up_force_path
 from haptic_bridge.hand import Hand, compile_script
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings, Transform
+from haptic_bridge.warm_up import warm_up as warm_up_force_path
 from tissue_sim.warm_up import warm_up as warm_up_tissue
 
 

@@ -1,6 +1,6 @@
 """Copies of bags in which something is otherwise."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from bags.metadata import read_metadata
@@ -10,15 +10,30 @@ from bags.writer import BagWriter
 from haptic_bridge.wire import PoseStampedCodec
 
 
-def rewritten(source: Path, target: Path, change: Callable[[Recorded], bytes | None]) -> Path:
-    """A copy of a bag in which messages are changed, or left out where `change` returns None."""
+def rewritten(
+    source: Path,
+    target: Path,
+    change: Callable[[Recorded], bytes | None] = lambda recorded: recorded.data,
+    added: Iterable[tuple[str, int, bytes]] = (),
+    number: Callable[[Recorded], int] = lambda recorded: recorded.sequence,
+) -> Path:
+    """A copy of a bag in which messages are changed, or left out where `change` returns None.
+
+    Args:
+        source, target: folders.
+        change: the new data of a message.
+        added: topic, time [ns since the epoch] and data of messages that are new.
+        number: of a message, in the sequence of its publisher.
+    """
     bag = open_bag(source)
     writer = BagWriter(target, custom_data=read_metadata(source)['custom_data'])
     for topic, kind in bag.topics().items():
         writer.add_topic(topic, kind, bag.schemas[kind], '', bag.profiles(topic))
     for m in bag.messages():
         if (data := change(m)) is not None:
-            writer.write(m.topic, m.log_time, m.publish_time, data, m.sequence)
+            writer.write(m.topic, m.log_time, m.publish_time, data, number(m))
+    for topic, time, data in added:
+        writer.write(topic, time, time, data)
     writer.close()
     return target
 

@@ -46,6 +46,11 @@ SCHEDULING = 0.03
 """[s] that a shared machine may let a process wait."""
 
 
+def refused(status: dict[str, str]) -> int:
+    """Messages that a node has refused, by its status on /diagnostics."""
+    return sum(int(value) for key, value in status.items() if key.startswith('refused '))
+
+
 @dataclass
 class Record:
     """What happened, by the clock of this machine."""

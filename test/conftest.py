@@ -7,6 +7,7 @@ Such a test is run again, at most twice, if it failed while a processor demonstr
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,6 +17,11 @@ from pathlib import Path
 
 import pytest
 from _pytest.runner import runtestprotocol
+from hypothesis import settings
+
+# How long an example takes is a matter of the machine, and of what it must compile first.
+settings.register_profile('trainer', deadline=None)
+settings.load_profile('trainer')
 
 STAND_INS = Path(__file__).with_name('stand_ins')
 PYTHON = f'python{sys.version_info.major}.{sys.version_info.minor}'
@@ -27,7 +33,13 @@ BUILT = pytest.StashKey[Path]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Starts to watch the processors."""
+    """Starts to watch the processors, and sees to it that an interrupt is one.
+
+    Whoever starts the suite in the background of a shell script has it ignore SIGINT, and every
+    process that it starts with it.
+    """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     folder = Path(tempfile.mkdtemp(prefix='stand-still-'))
     config.stash[OUTPUT], config.stash[REPEATED] = folder / 'seen', []
     with config.stash[OUTPUT].open('wb') as file:

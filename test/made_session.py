@@ -11,11 +11,12 @@ from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, UPDATES
 from bags.writer import BagWriter
 from haptic_bridge.force_path import ForcePath
 from haptic_bridge.wire import ContactCodec, ForceSampleCodec, PoseStampedCodec
-from session.experiment import Hand, closed_loop
-from session.recorded_scene import restore_scene
-from session.resimulate import recomputation
+from session.recordings.experiment import Hand, closed_loop
+from session.recordings.recorded_scene import restore_scene
+from session.recordings.resimulate import recomputation
 from session.scene import load_scene
-from tissue_sim.messages import DeltaEncoder, mesh_message, stamp
+from tissue_sim.messages import DeltaEncoder, mesh_message
+from tissue_sim.ros import stamp
 
 PERIOD = 50_000_000
 """[ns] of a frame."""

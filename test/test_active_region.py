@@ -7,10 +7,11 @@ from meshes import box
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.coupling import PUSH, Coupling
 from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.elasticity import ModelName
+from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.integrators import IntegratorName
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, TopologyDelta
+from tissue_sim.rings import Neighbours
 
 CELLS, SIZE = (16, 6, 3), 0.01
 
@@ -85,3 +86,48 @@ def test_a_cut_wakes_what_it_touched_and_the_same_frames_give_the_same_bits() ->
         assert dynamics.active_nodes > 0
         ends.append(dynamics.displacement.tobytes())
     assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize('model', ['linear', 'linear_smoothed'])
+def test_energy_and_force_that_are_kept_by_node_are_those_of_the_whole_tissue(
+    model: ModelName,
+) -> None:
+    """After sleeping, after a cut, after frames that followed it."""
+    _, _, dynamics = palpated(ActiveSettings('on'), model)
+    dynamics.apply_cut(TopologyDelta(removed_tetrahedra=np.array([100, 101, 102])))
+    for _ in range(3):
+        motion = dynamics.advance(Coupling())
+        assert dynamics.active_nodes < dynamics.mesh.node_count
+        force, energy = dynamics.model.evaluate(dynamics.displacement)
+        np.testing.assert_allclose(motion.elastic_force, force, atol=1e-12 * np.abs(force).max())
+        assert motion.elastic_energy == pytest.approx(energy, rel=1e-12)
+
+
+def test_neighbours_follow_cuts_as_if_they_were_found_anew() -> None:
+    nodes, tets = box((6, 4, 3), SIZE)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    model = ElasticModel(mesh, Material(3000.0, 0.4, 1000.0), 'linear')
+    assert len(model.neighbours.around(np.array([0]), 0)) == 1
+    random = np.random.default_rng(0)
+    for _ in range(12):
+        gone = random.choice(len(mesh.tetrahedra), 9, replace=False)
+        model.update(mesh.apply(TopologyDelta(removed_tetrahedra=gone)))
+        anew = Neighbours(mesh)
+        for seed in random.choice(mesh.node_count, 5):
+            for rings in (1, 2):
+                seeds = np.array([seed])
+                found = model.neighbours.around(seeds, rings)
+                np.testing.assert_array_equal(found, anew.around(seeds, rings))
+        ring = anew.around(seeds, 1)
+        together = mesh.tetrahedra[(mesh.tetrahedra == seed).any(axis=1)]
+        np.testing.assert_array_equal(ring, np.unique(together))
+
+
+@pytest.mark.parametrize('model', ['linear', 'linear_smoothed', 'corotational_smoothed'])
+def test_a_product_at_some_nodes_is_bit_for_bit_that_of_all(model: ModelName) -> None:
+    nodes, tets = box((6, 4, 3), SIZE)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    elastic = ElasticModel(mesh, Material(3000.0, 0.4, 1000.0), model)
+    x = np.random.default_rng(0).standard_normal((mesh.node_count, 3))
+    some = np.array([3, 40, 41, 77])
+    np.testing.assert_array_equal(elastic.product(x, some), elastic.product(x)[some])

@@ -1,6 +1,7 @@
 """The recorder on a real graph: what was published is in the bag, byte for byte."""
 
 import itertools
+import json
 import os
 import random
 import re
@@ -13,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,8 +31,10 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 
+from bags.node import Recorder
 from bags.reader import open_bag
 from bags.repair import repair_bag
+from session.scene import find_scene
 from tissue_sim.ros import ARM, CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
 
 pytestmark = pytest.mark.real_time
@@ -343,7 +347,8 @@ def test_a_recorder_killed_twenty_times_leaves_all_but_the_last_half_second_bit_
             place = {data: i for i, data in enumerate(all_sent)}
             places = [place[data] for data in kept]
             assert places == sorted(set(places))
-            assert times[places[-1] + 1] > end - 5e8
+            missing = times[places[-1] + 1 :]
+            assert not missing or missing[0] > end - 5e8
 
 
 def test_what_a_publisher_sent_before_the_recorder_heard_it_is_said(
@@ -375,6 +380,41 @@ def test_losses_are_on_diagnostics_and_they_and_all_parameters_are_in_the_bag(
     assert values['lost'] == '0'
     assert int(values['received /diagnostics']) >= int(values['written /diagnostics']) > 0
     assert int(values['bytes']) > 0
+
+
+def test_record_says_of_each_topic_what_came_was_written_was_lost_and_was_sent_before(
+    node: Node, tmp_path: Path
+) -> None:
+    early = node.create_publisher(String, '/early', LATCHED)
+    early.publish(String(data='before'))
+    early.publish(String(data='the newest is heard'))
+    bag = tmp_path / 'bag'
+    command = [sys.executable, '-m', 'session.cli', 'record', '-o', str(bag), '--json']
+    recording = subprocess.Popen(
+        [*command, '--domain', str(DOMAIN), '--scene', 'block', '--seed', '7'],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        wait_for(lambda: early.get_subscription_count() == 1, 'the recorder')
+        stream = heard(node, PoseStamped, '/stream', QoSProfile(depth=1000))
+        publish_at_1_khz(stream, poses(500))
+        time.sleep(0.5)
+        recording.send_signal(signal.SIGINT)
+        said, notes = recording.communicate(timeout=PATIENCE)
+    finally:
+        recording.kill()
+    assert recording.returncode == 0, notes
+    assert f'recording into {bag}; Ctrl-C ends it' in notes
+    account = json.loads(said)
+    assert account['bag'] == str(bag) and account['failure'] == ''
+    whole = {'received': 500, 'written': 500, 'lost': 0, 'unheard': 0}
+    assert account['topics']['/stream'] == whole
+    assert account['topics']['/early'] == {'received': 1, 'written': 1, 'lost': 0, 'unheard': 1}
+    described = open_bag(bag).custom_data
+    assert described['scene'] == find_scene('block').read_text() and described['seed'] == '7'
 
 
 def test_a_full_disk_does_not_end_the_recorder_and_the_loss_is_counted_and_said(
@@ -423,3 +463,21 @@ def test_a_recorder_that_cannot_work_says_why_and_ends(
     assert ended.returncode == 2
     assert ended.stderr.startswith('error: ') and complaint in ended.stderr
     assert not (tmp_path / 'new').exists()
+
+
+def test_a_topic_that_is_found_while_the_topics_are_counted_does_no_harm() -> None:
+    class Counter:
+        """Of a topic; while it is asked, another thread finds a topic."""
+
+        received = before = 0
+
+        @property
+        def lost(self) -> int:
+            streams[f'/found_{len(streams)}'] = streams['/first']
+            return 0
+
+    streams = {'/first': SimpleNamespace(counter=Counter()), '/second': SimpleNamespace()}
+    streams['/second'].counter = streams['/first'].counter
+    writer = SimpleNamespace(tally=SimpleNamespace(counts={}), lost={})
+    counted = Recorder.accounts(SimpleNamespace(_streams=streams, writer=writer))  # type: ignore[arg-type]
+    assert counted.keys() == {'/first', '/second'}

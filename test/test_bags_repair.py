@@ -13,7 +13,7 @@ from bags.metadata import read_metadata
 from bags.reader import open_bag
 from bags.repair import repair_bag
 from bags.writer import BagWriter
-from session.repair import told
+from session.recordings.repair import told
 
 MESSAGES = some_messages(500)
 

@@ -3,14 +3,15 @@
 import json
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 
-from session.bench_timing import cyclictest_row, measured
 from session.evidence import Status
-from tissue_sim.timing import TIMELY, Durations, PeriodicLoop
+from session.measure.bench_timing import cyclictest_row, measured
+from tissue_sim.timing import TIMELY, Durations, PeriodicLoop, Turns
 
 CYCLICTEST = """\
 # /dev/cpu_dma_latency set to 0us
@@ -71,6 +72,29 @@ def test_deadlines_that_a_loop_slept_through_were_not_met():
     assert loop.report()['timely'] == pytest.approx(timely)
 
 
+def test_a_loop_that_never_rests_does_not_take_its_lock_again_before_who_waits_for_it():
+    turns, ended, overtaken = Turns(), threading.Event(), []
+    held = 0
+
+    def work() -> None:
+        nonlocal held
+        while not ended.is_set():
+            with turns:
+                held += 1
+                time.sleep(0.002)
+
+    loop = threading.Thread(target=work)
+    loop.start()
+    for _ in range(21):
+        time.sleep(0.005)  # so that the loop has it now
+        before = held
+        with turns:
+            overtaken.append(held - before)
+    ended.set()
+    loop.join()
+    assert np.median(overtaken) == 0  # the machine may stand still before this thread asks
+
+
 def test_durations_are_reported_once():
     durations = Durations('wait', window=100)
     for value in range(1, 201):
@@ -83,7 +107,7 @@ def test_durations_are_reported_once():
 
 def test_the_bare_loop_says_how_late_it_woke():
     done = subprocess.run(
-        [sys.executable, '-m', 'session.reference_loop', '0.3'],
+        [sys.executable, '-m', 'session.measure.reference_loop', '0.3'],
         capture_output=True,
         text=True,
         check=True,

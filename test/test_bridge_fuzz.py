@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from bridge_world import DEPTH, PRESSED, K, Record, World, messages, session
+from bridge_world import DEPTH, PRESSED, K, Record, World, messages, refused, session
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from sensor_msgs.msg import Joy
@@ -191,4 +191,4 @@ def test_what_was_refused_was_said(record: Record) -> None:
     said = ' '.join(record.said)
     for word in ('message of the simulation', 'the device says that it is', 'frame_id'):
         assert word in said
-    assert float(record.statuses[-1]['rejected']) > 0
+    assert refused(record.statuses[-1]) > 0

@@ -1,22 +1,24 @@
 """The chart: references against formulas, fronts, what it writes; limits of stability."""
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bench.reproduction import block_100, block_258, efficiency, orders
-from session.chart import THESIS, cost_for, sentence, write_chart
-from session.chart_front import beaten, read_points, scenes, standing
-from session.chart_measure import Point, cpu_per_second, with_front
-from session.chart_meshes import end_load, kuhn_block
-from session.chart_problems import AfterCut, Cantilever, static_problems
-from session.chart_reference import HexGrid, Solid, exact_beam, extrapolated, graded
-from session.chart_region import LocalPalpation, describe
-from session.chart_vibration import Vibration
+from session.measure import chart, stability_report
+from session.measure.chart import THESIS, cost_for, sentence, write_chart
+from session.measure.chart_front import beaten, read_points, scenes, standing
+from session.measure.chart_measure import Point, cpu_per_second, with_front
+from session.measure.chart_meshes import end_load, kuhn_block
+from session.measure.chart_problems import AfterCut, Cantilever, static_problems
+from session.measure.chart_reference import HexGrid, Solid, exact_beam, extrapolated, graded
+from session.measure.chart_region import LocalPalpation, describe
+from session.measure.chart_vibration import Vibration
+from session.measure.stability_report import highest_mode, measured_limit
 from session.scene import load_scene
-from session.stability_report import highest_mode, measured_limit
 from tissue_sim.assembly import make_task
 from tissue_sim.dynamics import TimeStepping
 from tissue_sim.elasticity import ElasticModel
@@ -154,6 +156,18 @@ def test_page_table_and_a_picture_by_panel_are_written(tmp_path: Path) -> None:
     assert {(row['model'], row['integrator']) for row in rows} >= {THESIS}
 
 
+def test_the_chart_prints_the_points_for_machines_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(chart, 'measure', lambda progress, coarse: POINTS)
+    monkeypatch.setattr(chart, 'yardstick', lambda: 6.0)
+    monkeypatch.setattr(chart, 'write_chart', lambda folder, points, yardsticks: None)
+    chart.run_chart(tmp_path, as_json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert told['nanoseconds_a_tetrahedron'] == {'before': 6.0, 'after': 6.0}
+    assert [Point(**point) for point in told['points']] == POINTS
+
+
 def test_an_active_region_errs_less_with_a_smaller_tolerance_and_with_more_nodes() -> None:
     problem = LocalPalpation()
     regions = {describe(active): active for active in problem.regions(2)}
@@ -176,6 +190,35 @@ def test_the_measured_limit_of_stability_is_that_of_theory(model: str, integrato
     else:
         assert limit.measured == pytest.approx(limit.theory, rel=0.01)
         assert limit.used <= 1.001 * limit.theory
+
+
+def test_the_limits_are_printed_with_their_unit_and_whole_names(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv('COLUMNS', '80')
+    monkeypatch.setattr(stability_report, 'MODELS', ('corotational_smoothed',))
+    stability_report.run_stability('block')
+    said = capsys.readouterr().out
+    assert 'Largest stable step of block, in ms' in said and '96 tetrahedra' in said
+    for name in ('corotational_smoothed', 'symplectic_euler'):
+        assert name in said
+
+
+def test_the_limits_are_printed_for_machines_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(stability_report, 'MODELS', ('linear',))
+    stability_report.run_stability('block', as_json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert (told['scene'], told['tetrahedra'], told['beta']) == ('block', 96, 3e-3)
+    limits = {limit['integrator']: limit for limit in told['limits']}
+    assert limits['rk4']['measured'] == pytest.approx(limits['rk4']['theory'], rel=0.01)
+    steps = told['frame'] / (told['safety'] * limits['rk4']['used'])
+    assert limits['rk4']['substeps'] == np.ceil(steps)
+    assert limits['implicit'] == {
+        'model': 'linear', 'integrator': 'implicit',
+        'used': None, 'theory': None, 'measured': None, 'substeps': 1,
+    }  # fmt: skip
 
 
 def test_the_blocks_of_the_thesis_have_its_numbers_of_nodes_and_tetrahedra() -> None:

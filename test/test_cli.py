@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from session import cli
+from session import cli, commands_own
 from session.checks import Check, all_checks, run_checks, verdict
 from session.scene import SCENES, find_scene, load_scene
 from session.status import Status
@@ -33,6 +33,12 @@ def test_help_shows_each_command_with_one_line_and_the_exit_statuses(
     assert re.search(r'test +Run all checks', text)
     for status in Status:
         assert status.meaning.split()[0] in text and str(int(status)) in text
+
+
+def test_help_shows_the_units_of_what_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert trainer('soak', '--help') == 0
+    text = capsys.readouterr().out
+    assert 'Duration [min]' in text and 'session [s]' in text
 
 
 @pytest.mark.parametrize(
@@ -122,7 +128,6 @@ def test_mistake_in_a_scene_is_told_with_its_line(
         ('--scene', '{}/no_mesh.yaml', ['nix.msh does not exist', 'check the path']),
         ('--bag', '', ['--bag names no folder', 'give the path']),
         ('--bag', '{}/folder.yaml', ['exists already', 'name a new folder']),
-        ('--bag', '{}/no/bag', ['no does not exist', 'make it first']),
         ('--bag', '{}/words.yaml/bag', ['words.yaml is a file', 'name a folder']),
         ('--bag', '/proc/bag', ['/proc/bag cannot be made', 'name another folder']),
         ('--bag', '{}/' + 'x' * 300, ['cannot be made (file name too long)', 'name another']),
@@ -216,7 +221,7 @@ def test_test_command_runs_every_check_and_has_the_status_of_the_first_that_fail
 def test_test_command_of_an_installation_says_that_the_tests_are_in_the_source(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, '__file__', str(tmp_path / 'session' / 'cli.py'))
+    monkeypatch.setattr(commands_own, '__file__', str(tmp_path / 'session' / 'cli.py'))
     assert trainer('test') == Status.BAD_INPUT
     assert 'in a checkout of its source' in one_error_line(capsys)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from test_docs import launched
+from typer.main import get_command
 
 from session.cli import app
 from session.completion import LAUNCHERS_OWN, script
@@ -14,7 +15,7 @@ from session.completion import LAUNCHERS_OWN, script
 def completed(folder: Path, *words: str) -> list[str]:
     """What a Tab after these words offers."""
     file = folder / 'completion'
-    file.write_text(script(app, 'bash'))
+    file.write_text(script(get_command(app), 'bash'))
     line = ' '.join(f"'{word}'" for word in ('./trainer', *words))
     asked = f'. {file}; COMP_WORDS=({line}); COMP_CWORD={len(words)}; _trainer'
     program = ['bash', '-c', f'{asked}; echo "${{COMPREPLY[@]}}"']
@@ -32,6 +33,7 @@ def test_commands_are_those_of_the_help(tmp_path: Path) -> None:
     [
         (('im',), ['import-mesh']),
         (('demo', '--js'), ['--json']),
+        (('probe-device', '--no'), ['--no-moves']),
         (('demo', '--scene', 'li'), ['liver']),
         (('plan', 'fl'), ['flap']),
         (('import-mesh', '--unit', ''), ['m', 'cm', 'mm']),
@@ -48,7 +50,7 @@ def test_options_and_known_values_are_offered(
 @pytest.mark.skipif(shutil.which('zsh') is None, reason='zsh is not installed')
 def test_zsh_reads_the_script(tmp_path: Path) -> None:
     file = tmp_path / 'completion'
-    file.write_text(script(app, 'zsh'))
+    file.write_text(script(get_command(app), 'zsh'))
     command = ['zsh', '-fc', f'autoload -U compinit; compinit -D; . {file}; echo $_comps[trainer]']
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert '_bash_complete' in done.stdout, done.stderr

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from bench.cut_scaling import BLOCKS, stroke_costs
+from session.measure.bench_cut import BLOCKS, stroke_costs
 
 
 def test_the_same_stroke_costs_the_same_in_a_hundred_times_larger_mesh() -> None:
     """Cutting, adjacency, tensors, masses and frequency bound, by batch, in one run.
 
-    The claim is a factor of 1.5 on an idle machine (`bench/cut_scaling.py`); a pass over the mesh
+    The claim is a factor of 1.5 on an idle machine (`./trainer bench cut`); a pass over the mesh
     of 200,000 tetrahedra would cost a factor above 10.
     """
     small, large = (stroke_costs(BLOCKS[name], repeats=3) for name in ('2,000', '200,000'))

@@ -22,8 +22,9 @@ from haptic_bridge.settings import (
     Transform,
     check_together,
 )
-from haptic_bridge.stream_watch import StreamWatch
+from haptic_bridge.stream_watch import QUEUED, StreamWatch
 from haptic_bridge.wire import Sample
+from tissue_sim.refusals import Refusals
 from tissue_sim.share import share_folder
 
 PROFILES = sorted((share_folder() / 'config' / 'devices').glob('*.yaml'))
@@ -68,7 +69,7 @@ def test_there_is_a_profile_for_each_device_that_the_guide_names():
         ('max_force: .nan\nmax_slew: 9\nmax_stiffness: 9\n', 'max_force is nan'),
         ('max_force: 1\nmax_slew: 9\nmax_stiffness: 9\nsources: {weight: x}\n', 'sources'),
         ('- 1\n', 'a mapping'),
-        ('max_force: [\n', 'is not YAML'),
+        ('max_force: [\n', 'not valid YAML'),
     ],
 )
 def test_a_bad_profile_is_refused_with_file_key_and_what_would_be_right(tmp_path, text, said):
@@ -184,6 +185,28 @@ def test_a_message_that_is_late_or_invalid_is_no_jump_of_the_clock():
     assert not watch.see(4, 3 * SECOND, 3 * SECOND)
 
 
+def test_messages_that_wait_in_a_network_are_late_and_its_clock_is_believed():
+    watch = StreamWatch('force', queues=True)
+    delays = [0.02] * 30 + [0.8 - 0.03 * k for k in range(20)] + [0.02] * 30
+    late = []
+    for number, delay in enumerate(delays, 1):
+        sent = number * SECOND // 30
+        assert not watch.see(number, sent, round(sent + delay * SECOND))
+        late.append(watch.late)
+    assert [delay > 0.52 for delay in delays] == late
+
+
+def test_a_clock_that_was_set_back_behind_a_network_is_told_in_the_end():
+    watch = StreamWatch('force', queues=True)
+    said = []
+    for number in range(1, 200):
+        now = number * SECOND // 30
+        said.append(watch.see(number, now + 100 * SECOND - (number > 30) * 3600 * SECOND, now))
+    (told,) = (k for k, sentence in enumerate(said) if sentence)
+    assert (told - 30) / 30 == pytest.approx(QUEUED, abs=0.1)
+    assert not watch.late
+
+
 def test_a_frame_that_changes_is_told_and_its_new_name_is_taken():
     watch = StreamWatch('cp')
     frames = ['base', 'base', 'camera', 'camera']
@@ -193,8 +216,14 @@ def test_a_frame_that_changes_is_told_and_its_new_name_is_taken():
 
 
 class FakeNode:
-    def create_subscription(self, _kind, topic, callback, _qos):
+    max_message = 1000
+
+    def __init__(self):
+        self.refusals = Refusals()
+
+    def create_subscription(self, _kind, topic, callback, _qos, *, raw):
         self.topic, self.press = topic, callback
+        assert raw
 
 
 @pytest.fixture
@@ -203,7 +232,8 @@ def held():
     joy = pytest.importorskip('sensor_msgs.msg').Joy
     node, machine = FakeNode(), OperatingStateMachine()
     button = crtk.HoldButton(node, 'arm', machine)
-    return button, machine, lambda pressed: node.press(joy(buttons=[int(pressed)]))
+    encode = pytest.importorskip('rclpy.serialization').serialize_message
+    return button, machine, lambda pressed: node.press(encode(joy(buttons=[int(pressed)])))
 
 
 def test_there_is_force_only_while_the_button_is_held(held):

@@ -88,7 +88,16 @@ def rows(page: Path, pattern: str) -> set[tuple[str, str]]:
     return found
 
 
-BESIDE = ('crtk.py', 'probe_node.py', 'omni_node.py', 'player_node.py', 'dds_loopback.py')
+BESIDE = (
+    'crtk.py',
+    'probe_node.py',
+    'omni_node.py',
+    'player_node.py',
+    'dds_loopback.py',
+    'mesh_follower.py',
+    'operator.py',
+    'fuzz_graph.py',
+)
 """Modules whose topics carry a device's name, or another's messages, or are counted below."""
 
 
@@ -96,7 +105,7 @@ def made() -> set[tuple[str, str]]:
     """Names and short types of what the sources publish or serve."""
     found = set()
     for folder in ('tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session'):
-        for path in (ROOT / folder).glob('*.py'):
+        for path in (ROOT / folder).rglob('*.py'):
             for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
                 maker = isinstance(call, ast.Call) and getattr(call.func, 'attr', '')
                 if maker in ('create_publisher', 'create_service') and path.name not in BESIDE:
@@ -104,6 +113,7 @@ def made() -> set[tuple[str, str]]:
                     topic = eval(name, {'ros': ros, **vars(ros)})
                     found.add((topic.lstrip('/'), kind))
     found |= {(ros.MARKERS, 'MarkerArray'), (ros.HAND, 'PoseStamped')}  # of the viewer
+    found |= {(service, 'GetMesh') for service in ros.MESH_KEEPERS}
     for owner in (ros.ARM, 'haptic_bridge'):
         found.add((f'{owner}/operating_state', 'OperatingState'))
         found.add((f'{owner}/state_command', 'StringStamped'))

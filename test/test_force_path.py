@@ -5,7 +5,6 @@ import pytest
 from rig import FRAME, MS, PROFILE, QUIET, RADIUS, UNIT, K, Rig, lowered, pressed, spoiled
 
 from haptic_bridge.chain import INSIDE, NONE, TOUCHING
-from haptic_bridge.force_path import warm_up
 from haptic_bridge.operating_state import State
 from haptic_bridge.settings import (
     DeviceProfile,
@@ -15,6 +14,7 @@ from haptic_bridge.settings import (
     ToolSettings,
     Transform,
 )
+from haptic_bridge.warm_up import warm_up
 from haptic_bridge.wire import Sample
 
 
@@ -252,9 +252,9 @@ def test_soft_start_bounds_force_by_the_time_since_enabling():
 
 def test_repeated_and_reordered_messages_change_nothing():
     rig = pressed()
-    before = rig.path.rejected
+    before = rig.path.refusals.total
     out = rig.tick((0.0, 0.0, RADIUS - 4e-3), stamp=rig.now - 5 * MS)
-    assert rig.path.rejected == before + 1
+    assert rig.path.refusals.total == before + 1
     assert out.wrench[2] == pytest.approx(K * 5e-3)
 
 

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from session.chart_meshes import kuhn_block, pressed
+from session.measure.chart_meshes import kuhn_block, pressed
 from tissue_sim.compliance import solve_static
 from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.material import Material

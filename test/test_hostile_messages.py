@@ -71,11 +71,11 @@ def test_no_tissue_force_makes_a_force_beyond_the_limits_or_passes_unseen(change
 
     rig.spoil, start = spoil, len(rig.ticks)
     for _ in range(len(changes) + 1):
-        rejected = rig.path.rejected
+        rejected = rig.path.refusals.total
         rig.run(np.full(33, RADIUS - DEPTH))
         rig.state = State.ENABLED
         if seen and seen[-1]:
-            assert rig.path.rejected > rejected
+            assert rig.path.refusals.total > rejected
         seen.clear()
     check(rig, start)
     rig.inside = False

@@ -12,14 +12,14 @@ import trimesh
 from cutting.methods import make_method
 from haptic_bridge.force_path import ForcePath
 from haptic_bridge.hand import compile_script
-from session import mesher
 from session.errors import SessionError
-from session.import_mesh import SIDES, ImportOptions, import_mesh
-from session.imported_scene import height
 from session.in_process import InProcess, Tissue
+from session.organs import mesher
+from session.organs.import_mesh import SIDES, ImportOptions, import_mesh
+from session.organs.imported_scene import height
+from session.organs.surface_import import read_surface
 from session.scene import load_scene
 from session.status import Status
-from session.surface_import import read_surface
 from tissue_sim.assembly import make_simulation
 
 BODY = trimesh.creation.icosphere(subdivisions=3, radius=30.0)
@@ -176,7 +176,7 @@ def test_missing_file_and_huge_surface_are_refused(
     path = saved(tmp_path, BODY)
     with pytest.raises(SessionError, match=r'did you mean organ\.stl'):
         read_surface(tmp_path / 'orgn.stl', 'mm')
-    monkeypatch.setattr('session.surface_import.MOST_TRIANGLES', 100)
+    monkeypatch.setattr('session.organs.surface_import.MOST_TRIANGLES', 100)
     with pytest.raises(SessionError, match='simplify it'):
         read_surface(path, 'mm')
 
@@ -233,6 +233,20 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     return folder / 'mine.yaml', json.loads(done.stdout)
 
 
+def test_surface_that_crosses_itself_is_refused_with_the_place_and_nothing_is_written(
+    tmp_path: Path,
+) -> None:
+    mesh = BODY.copy()
+    top = mesh.vertices[:, 2] > 16.0
+    mesh.vertices[top] -= [0.0, 0.0, 48.0]  # through the underside
+    options = ImportOptions(
+        saved(tmp_path, mesh), tmp_path / 'mine', 'mm', 0.009, '-z', as_json=True
+    )
+    with pytest.raises(SessionError, match=r'mm from the surface, near .*crosses itself there'):
+        import_mesh(options)
+    assert {path.name for path in tmp_path.iterdir()} == {'organ.stl'}
+
+
 def test_imported_mesh_is_the_body_and_the_report_says_how_good_it_is(
     imported: tuple[Path, dict[str, object]],
 ) -> None:
@@ -279,8 +293,8 @@ def test_imported_scene_is_pressed_and_cut_by_its_own_script(
 
 @pytest.mark.parametrize('side', SIDES)
 def test_side_on_which_it_rests_is_turned_down_without_mirroring(side: str) -> None:
-    from session.import_mesh import _placed
-    from session.surface_import import Surface
+    from session.organs.import_mesh import _placed
+    from session.organs.surface_import import Surface
 
     box = trimesh.creation.box([0.04, 0.05, 0.06])
     axis, sign = SIDES[side]

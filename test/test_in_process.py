@@ -7,9 +7,8 @@ from meshes import irregular_box
 from haptic_bridge.force_path import ForcePath
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
 from session.errors import SessionError
-from session.haptics_accuracy import run_accuracy
-from session.haptics_stability import run_stability
 from session.in_process import InProcess, LinkSettings, Tissue
+from session.measure.haptics_pages import run_accuracy, run_stability
 from tissue_sim.blade import Resistance
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh

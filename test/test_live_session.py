@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from bag_copies import moved_by, rewritten
 from live import (
     CONTACT,
@@ -31,6 +32,7 @@ from bags.comparison import compare
 from bags.frames import read_frames
 from bags.metadata import read_metadata
 from bags.reader import open_bag
+from bags.topics import CUTS, DIAGNOSTICS
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.wire import (
     ContactCodec,
@@ -38,8 +40,8 @@ from haptic_bridge.wire import (
     PoseStampedCodec,
     WrenchStampedCodec,
 )
-from session.recorded_scene import restore_scene
-from session.resimulate import pose_check, recomputation
+from session.recordings.recorded_scene import restore_scene
+from session.recordings.resimulate import pose_check, recomputation
 from session.scene import load_scene
 from session.status import Status
 from tissue_sim.replica import MeshReplica
@@ -107,6 +109,35 @@ def test_session_runs_to_its_end_and_says_so(session: LiveSession, recording: Re
     assert not session.running()
     assert (session.bag / 'log').is_dir()
     assert 'elements cut' in session.said
+
+
+def test_bag_of_a_session_holds_scene_seed_versions_parameters_and_service_calls(
+    session: LiveSession, recording: Recording
+) -> None:
+    about = recording.bag.custom_data
+    assert about['scene'] == session.scene.read_text() and about['scene_file'] == session.scene.name
+    assert about['seed'] == '0' and about['trainer_version'] and about['numpy_version']
+    parameters = yaml.safe_load(about['parameters'])
+    assert parameters.keys() >= {f'/{node}' for node in NODES}
+    assert parameters['/haptic_bridge']['auto_enable'] is True
+    calls = [recording.bag.read(message) for message in recording.messages(CUTS)]
+    assert any(call.request for call in calls) and any(call.response for call in calls)
+    assert '/arm/operating_state/_service_event' in recording.bag.topics()
+
+
+def test_losses_on_diagnostics_are_topic_by_topic_those_of_the_sequence_numbers(
+    recording: Recording,
+) -> None:
+    arrays = map(recording.bag.read, recording.messages(DIAGNOSTICS))
+    (last,) = [a.status[0] for a in arrays if a.status[0].name == 'recorder'][-1:]
+    counts = {pair.key: pair.value for pair in last.values}
+    numbers = [m.sequence for m in recording.messages(CONTACT)]
+    gaps = sum(np.diff(numbers)) - (len(numbers) - 1)
+    assert 0 <= int(counts[f'lost {CONTACT}']) <= gaps
+    heard, written = (int(counts[f'{word} {CONTACT}']) for word in ('received', 'written'))
+    assert 0 < written <= heard <= len(numbers)
+    for topic in (MEASURED_CP, SERVO_CF, TISSUE_FORCE):
+        assert f'lost {topic}' in counts and f'unheard {topic}' in counts
 
 
 def test_there_is_no_force_before_the_first_contact_and_none_after_the_last(
@@ -266,9 +297,9 @@ def test_interrupt_while_the_bag_is_read_at_the_end_is_an_interrupt_as_any(
 
 
 def test_a_live_session_is_computed_again_from_its_bag_bit_for_bit(
-    session: LiveSession, tmp_path: Path
+    session: LiveSession, recording: Recording, tmp_path: Path
 ) -> None:
-    bag = open_bag(session.bag)
+    bag = recording.bag
     scene = load_scene(str(restore_scene(bag, tmp_path)))
     result = compare(bag, recomputation(scene), pose_check(scene))
     assert result.difference is None
@@ -278,9 +309,9 @@ def test_a_live_session_is_computed_again_from_its_bag_bit_for_bit(
 
 
 def test_one_pose_changed_in_the_bag_of_a_live_session_is_caught_at_its_frame(
-    session: LiveSession, tmp_path: Path
+    session: LiveSession, recording: Recording, tmp_path: Path
 ) -> None:
-    bag = open_bag(session.bag)
+    bag = recording.bag
     records = [record for record in read_frames(bag) if record.has_contact]
     changed = records[len(records) // 2]
     assert changed.pose is not None

@@ -1,9 +1,11 @@
 """Claims about CRTK's state machine."""
 
 import pytest
+import rclpy
 from hypothesis import given
 from hypothesis import strategies as st
 
+from haptic_bridge.node import HapticBridge
 from haptic_bridge.operating_state import (
     COMMANDS,
     E_STOP,
@@ -12,6 +14,7 @@ from haptic_bridge.operating_state import (
     crtk_types,
     device_cause,
 )
+from session.domain import reserved_domain
 
 D, E, P, F = State.DISABLED, State.ENABLED, State.PAUSED, State.FAULT
 INVALID = True
@@ -142,3 +145,29 @@ def test_a_device_in_any_state_but_enabled_or_not_homed_is_a_cause(state):
     assert device_cause('ENABLED', is_homed=True) == ''
     assert 'not homed' in device_cause('ENABLED', is_homed=False)
     assert 'not ENABLED' in device_cause(state, is_homed=True)
+
+
+def test_a_bridge_that_was_stopped_before_its_start_does_not_enable_itself(
+    tmp_path, monkeypatch: pytest.MonkeyPatch
+):
+    scene = tmp_path / 'scene.yaml'
+    scene.write_text('device: {profile: emulated}\n')
+    with reserved_domain('free') as domain:
+        rclpy.init(
+            args=['--ros-args', '-p', f'scene:={scene}', '-p', 'auto_enable:=true'],
+            domain_id=domain,
+        )
+    node = HapticBridge()
+    try:
+        node.configure()
+        monkeypatch.setattr(node._path, 'is_fresh', lambda now_ns: True)
+        monkeypatch.setattr(node._machine, '_cause', str)
+        node._machine.command(E_STOP)
+        node._watch_state()
+        assert (node._machine.state, node._machine.reason) == (F, 'emergency stop')
+        node._machine.command('disable')  # a person's
+        node._watch_state()
+        assert node._machine.state is E
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()

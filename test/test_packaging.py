@@ -37,6 +37,7 @@ NOT_FROM_PYPI = {
     'geometry_msgs',
     'launch',
     'launch_ros',
+    'lifecycle_msgs',
     'omni_msgs',
     'rcl_interfaces',
     'rclpy',
@@ -81,8 +82,8 @@ def test_every_pin_is_locked_to_the_same_version_and_has_its_reason(name: str) -
 def imported_by(folder: str) -> set[str]:
     """Names on PyPI of what the modules of a folder import."""
     imported: set[str] = set()
-    ours = {path.stem for path in (ROOT / folder).glob('*.py')}
-    for path in (ROOT / folder).glob('*.py'):
+    ours = {path.stem for path in (ROOT / folder).rglob('*.py')}
+    for path in (ROOT / folder).rglob('*.py'):
         if path.name == 'make_organ.py':
             continue  # a recipe, run in an environment of its own
         for node in ast.walk(ast.parse(path.read_text())):
@@ -122,13 +123,42 @@ def test_every_ros_package_that_is_imported_is_declared() -> None:
         for element in ElementTree.parse(ROOT / 'package.xml').getroot()
         if element.tag.endswith('depend')
     }
-    text = ''.join(path.read_text() for name in PACKAGES for path in (ROOT / name).glob('*.py'))
+    text = ''.join(path.read_text() for name in PACKAGES for path in (ROOT / name).rglob('*.py'))
     # crtk_msgs and omni_msgs are used where they are installed;
     # cutting_trainer_msgs is part of this package
     optional = {'crtk_msgs', 'cutting_trainer_msgs', 'omni_msgs'}
     for package in NOT_FROM_PYPI - optional:
         if re.search(rf'^\s*(from|import) {package}\b', text, re.MULTILINE):
             assert package in declared
+
+
+WITHOUT_ROS = """
+import importlib, sys
+class Nowhere:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] in sys.argv[1].split():
+            raise ImportError(f'{name} is imported')
+sys.meta_path.insert(0, Nowhere())
+for name in sys.argv[2:]:
+    importlib.import_module(name)
+"""
+CORE = (
+    'tissue_sim.assembly',
+    'tissue_sim.replica',
+    'cutting.methods',
+    'haptic_bridge.force_path',
+    'haptic_bridge.arm',
+    'bags.comparison',
+    'session.in_process',
+    'session.recordings.resimulate',
+    'session.trials.chaos_verdict',
+)
+
+
+def test_the_core_needs_no_ros() -> None:
+    command = [sys.executable, '-c', WITHOUT_ROS, ' '.join(NOT_FROM_PYPI), *CORE]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_workflow_and_hooks_run_what_the_readme_says() -> None:

@@ -45,7 +45,7 @@ def test_value_that_cannot_be_is_refused_with_name_range_and_meaning(value: obje
 
 def test_no_node_has_a_parameter_without_a_description() -> None:
     for folder in ('tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'viewer', 'session'):
-        for path in (PACKAGES / folder).glob('*.py'):
+        for path in (PACKAGES / folder).rglob('*.py'):
             for call in ast.walk(ast.parse(Path(path).read_text(encoding='utf-8'))):
                 if isinstance(call, ast.Call) and getattr(call.func, 'attr', '') == (
                     'declare_parameter'

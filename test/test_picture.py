@@ -11,9 +11,9 @@ from bags.message_text import schema_text
 from bags.qos import OfferedQos
 from bags.writer import BagWriter
 from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
-from session import picture
 from session.errors import SessionError
-from session.picture import make_picture, read_story
+from session.recordings import picture
+from session.recordings.picture import make_picture, read_story
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

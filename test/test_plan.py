@@ -1,6 +1,7 @@
 """The planner: what it asks of a mesh, what it takes, what it says when nothing fits."""
 
 import json
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,8 @@ from meshes import box, irregular_box
 
 from bench.plan_check import deep_error, script_presses, settlement_error
 from bench.quadratic import QuadraticTissue
-from session.chart_problems import LargeRotation
-from session.plan_report import as_data, report
+from session.measure.chart_problems import LargeRotation
+from session.measure.plan_report import as_data, report
 from session.scene import load_scene
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.assembly import make_simulation, make_task
@@ -20,13 +21,14 @@ from tissue_sim.compliance import solve_static
 from tissue_sim.dent import dents
 from tissue_sim.elasticity import ElasticModel
 from tissue_sim.equilibrium import equilibrium
-from tissue_sim.frame_cost import with_regions
+from tissue_sim.frame_cost import frame_cost, with_regions
 from tissue_sim.hyperelastic import neo_hookean
+from tissue_sim.integrators import IntegratorName
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.method_errors import errors_at_rest, time_error
 from tissue_sim.plan import Plan, plan
-from tissue_sim.press import places
+from tissue_sim.press import places, settlement
 from tissue_sim.probe import Probing, Strains
 from tissue_sim.refine import refined
 
@@ -134,11 +136,33 @@ def block() -> TetMesh:
 def test_a_shallow_dent_is_linear_and_a_deep_one_errs_the_more_the_deeper(block: TetMesh) -> None:
     press = places(block, 0.015, 1)[0]
     shallow, deep, deeper = (
-        max(d.error(rotating=False) for d in dents(block, GEL, press, depth))
-        for depth in (1e-5, 0.004, 0.008)
+        dents(block, GEL, press, depth).error(rotating=False) for depth in (1e-5, 0.004, 0.008)
     )
     assert shallow < 2e-3
     assert 10 * shallow < deep < deeper
+
+
+def test_in_a_deep_dent_the_prediction_covers_what_finer_quadratic_elements_find(
+    block: TetMesh,
+) -> None:
+    """They took 0.7534 N for 6 mm: `QuadraticTissue(refined(block), GEL).force(press, 0.006)`."""
+    press = places(block, 0.015, 1)[0]
+    soft = settlement(ElasticModel(block, GEL, 'linear_smoothed'), press.load(block))[0]
+    wrong = abs(0.7534 * soft / 0.006 - 1)
+    found = dents(block, GEL, press, 0.006)
+    assert 0.14 < wrong < found.error(rotating=False) < 0.2
+    assert abs(found.whole.error(rotating=False)) < wrong / 2
+
+
+def test_a_plan_for_a_dent_deeper_than_was_checked_says_so(block: TetMesh) -> None:
+    task = make_task(load_scene('palpation').tissue)
+
+    def caution(depth: float) -> str:
+        budget = Budget(displacement=depth, contact_radius=0.015, error=0.9, cuts=False)
+        return plan(replace(task, mesh=block, material=GEL, budget=budget)).caution
+
+    assert caution(0.005) == ''
+    assert 'the dent is 0.53 of its radius deep, and errors are checked up to 0.4' in caution(0.008)
 
 
 @pytest.fixture(scope='module')
@@ -231,6 +255,26 @@ def test_a_scene_whose_own_method_does_not_meet_its_budget_is_told(plans: dict[s
         f'the scene takes linear by {settings.integrator}, which does not meet its budget' in text
     )
     assert 'tissue.method: auto would follow the plan' in text
+
+
+@pytest.mark.parametrize('integrator', ['symplectic_euler', 'implicit'])
+def test_what_else_the_machine_does_during_a_stroke_is_not_counted_as_cost(
+    integrator: IntegratorName, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = make_task(load_scene('block').tissue)
+    clock = [0.0, 0]
+
+    def tick(busy: bool) -> float:
+        clock[1] += 1
+        clock[0] += 1e-3 + 0.05 * (busy and clock[1] % 96 < 32)
+        return clock[0]
+
+    costs = []
+    for busy in (False, True):
+        clock[1] = 0
+        monkeypatch.setattr(time, 'thread_time', lambda busy=busy: tick(busy))
+        costs.append(frame_cost(task, 'linear', integrator).frame)
+    assert costs[1] == pytest.approx(costs[0])
 
 
 def test_a_region_of_few_nodes_makes_a_large_tissue_cheaper_and_its_error_is_counted() -> None:

@@ -13,13 +13,20 @@ import rclpy
 from cutting_trainer_msgs.msg import Contact
 from cutting_trainer_msgs.srv import Cut
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from live import wait_for
+from live import LiveSession, free_domain, two_presses, wait_for, write_scene
 from rclpy.executors import SingleThreadedExecutor
 from ruamel.yaml import YAML
+from std_msgs.msg import Header
 
+from bags.comparison import compare
+from bags.reader import open_bag
 from session.domain import reserved_domain
 from session.graph import node_environment
+from session.recordings.html_report import write_report
+from session.recordings.recorded_scene import restore_scene
+from session.recordings.resimulate import pose_check, recomputation
 from session.scene import load_scene
+from session.status import Status
 from tissue_sim import ros
 from tissue_sim.assembly import make_task
 from tissue_sim.contact import State, ToolContact, press_triangle
@@ -84,6 +91,7 @@ class Surroundings:
         weights = np.zeros(9)
         weights[:3] = contact.weights
         return Contact(
+            header=Header(frame_id=ros.FRAME),
             sequence=self._sent,
             state=int(State.TOUCHING),
             topology=0,
@@ -200,3 +208,28 @@ def test_a_node_for_whose_budget_nothing_fits_runs_as_the_scene_says_and_says_so
     wait_for(lambda: sentence in surroundings.status.message, 'the status')
     assert surroundings.status.level == DiagnosticStatus.WARN
     assert 'a mesh with edges' in surroundings.status.message
+
+
+@pytest.mark.real_time
+def test_a_session_that_plans_is_computed_again_and_reported_by_what_it_took(
+    tmp_path: Path,
+) -> None:
+    path = write_scene(tmp_path, two_presses(), 4.0, cut_threshold=100.0)
+    scene = YAML(typ='safe').load(path)
+    scene['tissue'] |= {'method': 'auto', 'model': 'corotational', 'integrator': 'rk4'}
+    with path.open('w') as file:
+        YAML().dump(scene, file)
+    session = LiveSession(tmp_path, path, free_domain())
+    try:
+        assert session.end() == Status.OK, session.said
+    finally:
+        session.clean()
+    bag = open_bag(session.bag)
+    restored = load_scene(str(restore_scene(bag, tmp_path)))
+    assert (restored.tissue.method, restored.tissue.model) == ('given', 'linear_smoothed')
+    result = compare(bag, recomputation(restored), pose_check(restored))
+    assert result.difference is None and not result.missing
+    assert result.frames > 50
+    write_report(session.bag, tmp_path / 'report.html')
+    taken = f'linear_smoothed by {restored.tissue.integrator}'
+    assert taken in (tmp_path / 'report.html').read_text()

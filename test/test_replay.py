@@ -12,20 +12,36 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
+from bag_copies import rewritten
 from cutting_trainer_msgs.msg import ForceSample, Mesh, MeshDelta
 from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import QoSCompatibility, qos_check_compatible
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Joy
 
 from bags.errors import BagError
 from bags.player import STEP, Playhead, ReadAhead, RecordedHand, RecordedStream, duration
-from bags.player_node import SessionPlayer, publisher_qos
-from bags.reader import Recorded, open_bag
-from bags.topics import CONTACT, FORCE, MESH, OF_DEVICE, OF_TISSUE, POSE, SERVO_CF, UPDATES
+from bags.player_node import HandPlayer, SessionPlayer, publisher_qos
+from bags.reader import Bag, Recorded, open_bag
+from bags.topics import (
+    BUTTON,
+    CONTACT,
+    FORCE,
+    MESH,
+    OF_DEVICE,
+    OF_TISSUE,
+    POSE,
+    REPLAYED,
+    SERVO_CF,
+    UPDATES,
+)
+from haptic_bridge.operating_state import crtk_types
 from session.domain import reserved_domain
 from session.errors import SessionError
-from session.replay import _Over, act_on, replay_nodes
+from session.recordings.replay import _Over, act_on, replay_nodes
 from tissue_sim import ros
 from tissue_sim.replica import MeshReplica
 
@@ -130,6 +146,36 @@ def test_the_recorded_hand_is_where_it_was() -> None:
     assert hand.pose(last + 9.0).stamp_ns > hand.pose((first + last) / 2).stamp_ns
 
 
+PRESSES = {1.0: 0, 1.5: 1, 3.0: 0}
+"""[s] of the session at which the button changes, and to what."""
+
+
+@pytest.fixture
+def pressed(tmp_path: Path) -> Bag:
+    """The sample with a hand that presses its button."""
+    begin = open_bag(SAMPLE).span[0]
+    events = [
+        (BUTTON, begin + round(time * 1e9), serialize_message(Joy(buttons=[state])))
+        for time, state in PRESSES.items()
+    ]
+    return open_bag(rewritten(SAMPLE, tmp_path / 'pressed', added=events))
+
+
+def test_the_button_does_what_it_did_and_after_a_way_back_is_as_it_was_there(pressed: Bag) -> None:
+    hand = RecordedHand(pressed)
+    recorded = [m.data for m in pressed.messages([BUTTON])]
+    assert [pressed.read(m).buttons[0] for m in pressed.messages([BUTTON])] == [0, 1, 0]
+    given, done = hand.events(0, 0.5)
+    assert (given, done) == ([], 0)
+    for position in np.linspace(0.5, 4.0, 20):
+        events, done = hand.events(done, position)
+        given += events
+    assert given == recorded and done == 3
+    assert hand.events(done, 2.0) == ([recorded[1]], 2)
+    assert hand.events(done, 4.0) == ([], 3)
+    assert hand.events(0, 4.0) == (recorded, 3)
+
+
 def test_a_replayed_topic_suits_every_subscriber_of_ours() -> None:
     bag = open_bag(SAMPLE)
     for topic, wanted in SUBSCRIBERS.items():
@@ -145,11 +191,9 @@ def test_nodes_of_a_replay_speak_to_no_device_unless_told_to() -> None:
         bridge = next(node for node in nodes if node.name == 'haptic_bridge')
         return [word for word in bridge.argv if ':=/replay' in word]
 
-    assert remapped(False) == [
-        'arm/measured_cp:=/replay/arm/measured_cp',
-        'arm/servo_cf:=/replay/arm/servo_cf',
-    ]
-    assert remapped(True) == ['arm/measured_cp:=/replay/arm/measured_cp']
+    of_device = ['arm/measured_cp:=/replay/arm/measured_cp', 'arm/button:=/replay/arm/button']
+    assert remapped(False) == [*of_device, 'arm/servo_cf:=/replay/arm/servo_cf']
+    assert remapped(True) == of_device
 
 
 @pytest.fixture
@@ -167,7 +211,80 @@ def test_a_recorded_force_is_played_to_a_device_only_when_told_to(context: rclpy
             context, Playhead(0.0, 1.0), open_bag(SAMPLE), 0.0, drive_device=drive
         )
         assert (SERVO_CF in player.topics) == drive
-        assert all((topic in player.topics) != drive for topic in OF_DEVICE)
+        assert all((topic in player.topics) != drive for topic in (*OF_DEVICE, BUTTON))
+        player.stop()
+
+
+def hand_player(context: rclpy.Context, playhead: Playhead, bag: Bag) -> HandPlayer:
+    player = HandPlayer(context, playhead, RecordedHand(bag))
+    player.advertise()
+    return player
+
+
+def test_the_hand_goes_once_the_bridge_is_enabled_and_presses_its_button_again(
+    context: rclpy.Context, pressed: Bag
+) -> None:
+    playhead = Playhead(1.2, 4.0, rate=2.0)
+    player = hand_player(context, playhead, pressed)
+    node = rclpy.create_node('bridge', context=context)
+    states = node.create_publisher(
+        crtk_types().operating_state, '/haptic_bridge/operating_state', ros.LATCHED
+    )
+    presses = ros.polled(node, Joy, f'{REPLAYED}{BUTTON}', ros.EVENTS)
+    heard: list[int] = []
+
+    def hear() -> None:
+        while (message := ros.take(presses)) is not None:
+            heard.append(message.buttons[0])
+
+    try:
+        player.start()
+        time.sleep(0.5)
+        hear()
+        assert playhead.paused and playhead.position == 1.2 and heard == [0]
+        states.publish(crtk_types().operating_state(state='PAUSED'))  # its button is to be held
+        deadline = time.monotonic() + 20.0
+        while not playhead.over and time.monotonic() < deadline:
+            hear()
+            time.sleep(0.01)
+        time.sleep(0.2)
+        hear()
+        assert playhead.over and player.refusal == '' and player.faulted is None
+        assert heard == [0, 1, 0]
+    finally:
+        player.stop()
+        node.destroy_node()
+
+
+def test_a_bridge_that_was_enabled_too_shortly_to_be_heard_ends_the_replay(
+    context: rclpy.Context,
+) -> None:
+    playhead = Playhead(0.0, 5.0)
+    player = hand_player(context, playhead, open_bag(SAMPLE))
+    node = rclpy.create_node('bridge', context=context)
+    state = crtk_types().operating_state
+    states = node.create_publisher(state, '/haptic_bridge/operating_state', ros.LATCHED)
+    try:
+        states.publish(state(state='FAULT'))  # a latched topic keeps the newest: ENABLED is gone
+        player.start()
+        deadline = time.monotonic() + 20.0
+        while player.faulted is None and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert player.faulted == playhead.position == 0.0
+    finally:
+        player.stop()
+        node.destroy_node()
+
+
+def test_a_bridge_that_says_nothing_is_not_waited_for_for_ever(context: rclpy.Context) -> None:
+    player = hand_player(context, Playhead(0.0, 5.0), open_bag(SAMPLE))
+    try:
+        player.watch(100.0)
+        player.watch(129.0)
+        assert player.refusal == ''
+        player.watch(131.0)
+        assert player.refusal.startswith('the haptic bridge was not enabled within 30 s')
+    finally:
         player.stop()
 
 
@@ -308,7 +425,7 @@ def test_the_recorded_hand_cuts_the_tissue_again(tmp_path: Path) -> None:
 
 
 def test_a_start_beyond_the_end_is_refused() -> None:
-    from session.replay import ReplayOptions, replay
+    from session.recordings.replay import ReplayOptions, replay
 
     options = ReplayOptions(SAMPLE, True, 1.0, 1e4, False, 'free', None, False)
     with pytest.raises(SessionError, match='the session lasts'):

@@ -17,10 +17,10 @@ from bags.tissue import tissue_at
 from bags.topics import FORCE, MESH, SERVO_CF
 from haptic_bridge.wire import ForceSampleCodec
 from session.errors import SessionError
-from session.export import export
-from session.html_report import force_peaks, incision_area, write_report
-from session.incision import distance_to_ways, extent, planned_ways, surface_length
-from session.recorded_scene import restore_scene
+from session.recordings.export import export
+from session.recordings.html_report import force_peaks, incision_area, write_report
+from session.recordings.incision import distance_to_ways, extent, planned_ways, surface_length
+from session.recordings.recorded_scene import restore_scene
 from session.scene import load_scene
 from tissue_sim.depth import DepthGauge
 from tissue_sim.mesh import TetMesh
@@ -165,6 +165,6 @@ def test_outputs_that_cannot_be_are_refused_in_one_sentence(tmp_path: Path) -> N
     with pytest.raises(SessionError, match='does not exist'):
         export(CUT, tmp_path / 'none' / 'mesh.vtk', None)
     with pytest.raises(BagError, match='there is no tissue'):
-        export(CUT, tmp_path / 'mesh.vtk', 0.0)
+        export(CUT, tmp_path / 'mesh.vtk', -1.0)
     with pytest.raises(SessionError, match=r'end its name in \.html'):
         write_report(CUT, tmp_path / 'report.pdf')

@@ -1,28 +1,35 @@
 """A session is computed again from its bag bit for bit, and one change in the bag is caught."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from bag_copies import moved_by, rewritten
 from made_session import make_session
+from rclpy.serialization import deserialize_message, serialize_message
 
 from bags.comparison import Comparison, compare
 from bags.errors import BagError
-from bags.frames import nanoseconds, read_frames
+from bags.frames import read_frames
+from bags.message_class import message_class
 from bags.reader import Recorded, open_bag
 from bags.repair import copy_bag
 from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, UPDATES
 from haptic_bridge.wire import ContactCodec, ForceSampleCodec
 from session import cli
-from session.experiment import Run, run_experiment
-from session.recorded_scene import parse_changes, restore_scene
-from session.resimulate import pose_check, recomputation
+from session.errors import SessionError
+from session.recordings.experiment import Run, run_experiment
+from session.recordings.recorded_scene import parse_changes, restore_scene
+from session.recordings.resimulate import pose_check, recomputation, verdict
 from session.scene import load_scene
+from tissue_sim.stamps import nanoseconds
 
 SAMPLES = Path(__file__).parents[1] / 'bags' / 'samples'
+OF_TISSUE = (INPUTS, MESH, UPDATES, FORCE)
 BAGS = sorted(path.parent for path in SAMPLES.glob('format_*/*/metadata.yaml'))
 CUT = SAMPLES / 'format_2' / 'straight_cut'
 
@@ -157,6 +164,48 @@ def test_frames_lost_by_the_recorder_end_the_computation_with_their_number(
     result = resimulated(rewritten(made, tmp_path / 'bag', change), tmp_path)
     assert result.frames == 29
     assert result.difference is not None and 'lacks frame 30' in result.difference.what
+    assert verdict(result, 1.0)[0].startswith('identical for 29 frames; ')
+
+
+@pytest.mark.parametrize('back', [0, 7])
+def test_a_session_in_which_the_simulation_was_started_again_is_compared_up_to_there(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], back: int
+) -> None:
+    """The other process goes on where the first ended, or from some frames before."""
+    bag = open_bag(made)
+    inputs = [(m, bag.read(m)) for m in bag.messages([INPUTS])]
+    last = loaded_frame(made, 0.4).step
+    at = next(m.log_time for m, frame in inputs if frame.step > last)
+    numbers: Counter[str] = Counter()
+
+    def renumbered(m: Recorded) -> int:
+        """As publishers count; that of another process from 1 again."""
+        again = m.log_time >= at and m.topic in OF_TISSUE
+        numbers[f'{m.topic} {again}'] += 1
+        return numbers[f'{m.topic} {again}']
+
+    def change(m: Recorded) -> bytes:
+        if m.log_time < at or m.topic not in OF_TISSUE:
+            return m.data
+        message = deserialize_message(m.data, message_class(m.type))
+        if m.topic == FORCE:
+            message.force[0] += 1.0  # of another process, from another state
+        else:
+            message.step -= back
+        return serialize_message(message)
+
+    folder = rewritten(made, tmp_path / 'bag', change, number=renumbered)
+    result = resimulated(folder, tmp_path)
+    assert result.difference is None
+    assert result.frames == result.meshes == last
+    assert not result.missing
+    assert result.restart is not None and result.restart.step == last + 1 - back
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(['resimulate', str(folder)])
+    assert stopped.value.code == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f'identical up to the restart at {result.restart.seconds:.2f} s\n')
+    assert 'not compared: tissue_sim was started again' in said
 
 
 def test_a_bag_that_begins_in_the_middle_or_has_no_scene_is_refused(tmp_path: Path) -> None:
@@ -172,6 +221,31 @@ def test_a_bag_that_begins_in_the_middle_or_has_no_scene_is_refused(tmp_path: Pa
     del nameless.custom_data['scene']
     with pytest.raises(BagError, match='has no scene'):
         restore_scene(nameless, tmp_path)
+
+
+def test_a_planned_method_is_that_which_the_bag_names_and_none_that_is_planned_anew(
+    tmp_path: Path,
+) -> None:
+    bag = open_bag(CUT)
+    bag.custom_data['scene'] = bag.custom_data['scene'].replace(
+        'tissue:', 'tissue:\n  method: auto'
+    )
+    taken = {
+        'model': 'corotational',
+        'integrator': 'rk4',
+        'active_region.mode': 'budget',
+        'active_region.nodes': 77,
+        'active_region.tolerance': 1e-3,
+    }
+    bag.custom_data['parameters'] = yaml.safe_dump({'/tissue_sim': {'seed': 0, **taken}})
+    tissue = load_scene(str(restore_scene(bag, tmp_path))).tissue
+    assert tissue.method == 'given'
+    assert tissue.method_taken == taken
+    changes = parse_changes(['tissue.model=linear'])
+    assert load_scene(str(restore_scene(bag, tmp_path, changes))).tissue.model == 'linear'
+    del bag.custom_data['parameters']
+    with pytest.raises(SessionError, match='the bag does not say what was planned'):
+        recomputation(load_scene(str(restore_scene(bag, tmp_path))))
 
 
 def test_the_same_hand_on_the_same_tissue_gives_the_same_and_on_a_tougher_one_more_force(

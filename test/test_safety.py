@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from haptic_bridge import safety
@@ -144,7 +144,6 @@ def test_clamp_bounds_the_norm_and_keeps_the_direction(wanted, ceiling):
     assert np.linalg.norm(np.cross(force, wanted)) <= 1e-9 * (1 + wanted @ wanted)
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(forces, st.floats(0, 1)), min_size=1, max_size=40),
     st.floats(0.5, 10),

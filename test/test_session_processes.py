@@ -166,7 +166,8 @@ def test_node_that_never_gets_ready_is_named_with_what_it_said_last(
     with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:
         assert not supervisor.start(timeout=1.0)
         outcome = supervisor.end()
-    assert outcome.unready.startswith('haptic_bridge not ready within 1 s; haptic_bridge said last')
+    assert outcome.unready.startswith('haptic_bridge not ready within 1 s (')
+    assert 'doctor); haptic_bridge said last' in outcome.unready
     assert 'careful' in outcome.unready
     assert not ledger.running()
 

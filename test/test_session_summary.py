@@ -17,7 +17,7 @@ from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
 from session.evidence import Evidence, Status, read_evidence
 from session.judge import Expected, judge
 from session.processes import Death, Outcome
-from session.report import session_tables
+from session.recordings.report import session_tables
 from session.summary import Summary, summarise
 
 RATES = {'tissue_sim': 30.0, 'haptic_bridge': 1000.0}

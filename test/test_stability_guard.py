@@ -1,5 +1,6 @@
 """What diverges is caught: shorter steps if they help, else no force, and a reason in words."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -96,6 +97,19 @@ def test_what_shorter_steps_do_not_mend_is_taken_back_with_no_force(
     assert not frame.force.any()
     assert np.array_equal(tissue.displacement, before)
     assert press(tissue, 3) == []
+
+
+def test_frames_that_need_shorter_steps_one_after_another_do_not_get_longer_without_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tissue = simulation()
+    usual = tissue.frame(None).substeps
+    verdicts = itertools.cycle(['it diverges', ''])  # and the next attempt does not
+    monkeypatch.setattr(Guard, 'trouble', lambda *_: next(verdicts))
+    frames = [tissue.frame(None) for _ in range(6)]
+    assert frames[0].substeps == 4 * usual and not frames[0].diverged
+    assert max(frame.substeps for frame in frames) <= 16 * usual
+    assert any(frame.diverged for frame in frames)
 
 
 def test_forward_euler_without_damping_is_refused_in_words() -> None:

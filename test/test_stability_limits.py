@@ -6,7 +6,7 @@ trainer uses: on a block as it was loaded, nearly incompressible, and cut at the
 
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -28,7 +28,6 @@ SIZE = 0.005
 STEPS = 100
 """Of a frame."""
 EXPLICIT = tuple(name for name in INTEGRATORS if name != 'implicit')
-every_model = pytest.mark.parametrize('name', MODELS)
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,9 @@ class Block:
 
 WHOLE, STIFF, CUT = Block(0.4, False), Block(0.499, False), Block(0.4, True)
 BLOCKS = {'whole': WHOLE, 'nearly incompressible': STIFF, 'cut': CUT}
+every_case = pytest.mark.parametrize(
+    ('block', 'integrator', 'name'), list(product(BLOCKS, EXPLICIT, MODELS))
+)
 
 
 @cache
@@ -103,9 +105,7 @@ def test_the_cut_block_has_slivers() -> None:
     assert mesh.volumes().min() < 0.02 * SIZE**3 / 6
 
 
-@every_model
-@pytest.mark.parametrize('integrator', EXPLICIT)
-@pytest.mark.parametrize('block', BLOCKS)
+@every_case
 def test_ten_thousand_steps_just_below_the_limit_give_no_trouble(
     block: str, integrator: IntegratorName, name: ModelName
 ) -> None:
@@ -117,9 +117,7 @@ def test_ten_thousand_steps_just_below_the_limit_give_no_trouble(
     assert np.abs(dynamics.displacement).max() < 1e-4
 
 
-@every_model
-@pytest.mark.parametrize('integrator', EXPLICIT)
-@pytest.mark.parametrize('block', BLOCKS)
+@every_case
 def test_just_above_the_limit_is_caught_and_named_and_shorter_steps_taken(
     block: str, integrator: IntegratorName, name: ModelName
 ) -> None:

@@ -5,8 +5,18 @@ import pytest
 
 from haptic_bridge.force_path import ForcePath
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
-from session.haptics_stability import COUPLING, Outcome, Place, block, run_once, run_place, tip_over
 from session.in_process import TICK, InProcess, LinkSettings, Tissue
+from session.measure.haptics_stability import (
+    COUPLING,
+    Cell,
+    Outcome,
+    Place,
+    block,
+    counts,
+    run_once,
+    run_place,
+    tip_over,
+)
 
 WORST = LinkSettings(delay=0.05, loss=0.05, jitter=0.01, seed=1)
 
@@ -73,6 +83,16 @@ def test_the_controller_is_run_wherever_it_would_have_something_to_do() -> None:
 def test_the_worst_of_the_seeds_is_what_counts_figure_by_figure() -> None:
     worst = Outcome(1e-5, 3e-4, False).worse(Outcome(4e-4, 1e-4, True))
     assert worst == Outcome(4e-4, 3e-4, True)
+
+
+def test_the_map_counts_as_passive_what_is_stable_too_and_bounds_50_ms_and_5_percent() -> None:
+    good, swings, makes = Outcome(1e-5, 1e-5), Outcome(1e-3, 1e-5), Outcome(1e-5, 1e-3)
+    outcomes = {(0.0, 0.0): good, (0.05, 0.05): makes, (0.05, 0.1): good, (0.075, 0.0): swings}
+    results = {Cell('time', 30.0, 50.0, *at, False): o for at, o in outcomes.items()}
+    without, with_ = counts(results | {Cell('time', 30.0, 50.0, 0.0, 0.0, True): good})
+    assert (without.cells, without.stable, without.both) == (4, 3, 2)
+    assert (without.bound, without.both_bound) == (2, 1)
+    assert (with_.controlled, with_.cells, with_.both_bound) == (True, 1, 1)
 
 
 def test_the_same_seed_gives_the_same_bits_behind_jitter_and_loss() -> None:

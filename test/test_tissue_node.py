@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rclpy
 from cutting_trainer_msgs.msg import Contact, ForceSample
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from live import free_domain, two_presses, wait_for, write_scene
 
 from session.graph import node_environment
@@ -36,22 +37,29 @@ class Tool:
         self._node = rclpy.create_node('tool', context=self._context)
         self._contacts = self._node.create_publisher(Contact, ros.CONTACT, ros.STREAM)
         self._forces = ros.polled(self._node, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
+        self._status = ros.polled(self._node, DiagnosticArray, ros.DIAGNOSTICS, ros.EVENTS)
         self.sequence = 0
 
-    def at(self, depth: float) -> Any:
-        """Says that the tool is so deep [m]; the newest force, or None if there is no new one."""
+    def at(self, depth: float, stiffness: float = 200.0) -> Any:
+        """Says that the tool is so deep [m], on a spring [N/m]; the newest force, or None."""
         self.sequence += 1
         up = np.array([0.0, 0.0, 1.0])
         surface = self._point + 0.004 * up
         message = Contact(state=Contact.TOUCHING, sequence=self.sequence)
+        message.header.frame_id = ros.FRAME
         message.nodes = np.array([*self._nodes, *[0] * 6], np.uint32)
         message.weights = np.array([1 / 3] * 3 + [0.0] * 6)
         message.point, message.proxy = self._point, surface
         message.normal, message.device = up, surface - depth * up
-        message.coupling_stiffness, message.proxy_radius = 200.0, 0.004
+        message.coupling_stiffness, message.proxy_radius = stiffness, 0.004
         message.blade_tip, message.blade_root = message.device, message.device + 0.02 * up
         self._contacts.publish(message)
         return ros.take(self._forces)
+
+    def status(self) -> DiagnosticStatus | None:
+        """What the node has said of itself since the last time."""
+        array = ros.take(self._status)
+        return array.status[0] if array else None
 
     def close(self) -> None:
         self._node.destroy_node()
@@ -81,12 +89,49 @@ def tool(tmp_path: Path) -> Iterator[Tool]:
             process.wait()
 
 
-def test_a_tool_that_jumps_is_felt_no_more_and_the_log_says_why(tool: Tool, tmp_path: Path) -> None:
+def wait_until_felt(tool: Tool) -> None:
     def pressed() -> Any:
         sample = tool.at(0.003)
         return sample is not None and sample.force[2] > 0.05
 
     wait_for(pressed, 'a force')
+
+
+def test_a_frame_that_shorter_steps_do_not_mend_has_no_force_and_the_log_names_limit_and_cause(
+    tool: Tool, tmp_path: Path
+) -> None:
+    """The tool is driven through the block, no faster than a hand, by a spring that is rigid."""
+    wait_until_felt(tool)
+    driven = tool.sequence + 1
+
+    def of_it() -> Any:
+        sample = tool.at(0.09, stiffness=1e5)
+        return sample if sample is not None and sample.contact_sequence >= driven else None
+
+    sample = wait_for(of_it, 'the frame of it')
+    assert not any(sample.force) and not any(sample.stiffness)
+    assert sample.state == Contact.NONE
+
+    def said() -> str:
+        of_it()
+        return (tmp_path / 'log').read_text()
+
+    wait_for(lambda: 'farther than the tissue is long, 0.0574 m' in said(), 'the reason')
+    line = next(line for line in said().splitlines() if 'farther than' in line)
+    assert 'tetrahedra are inside out' in line
+    assert 'at which symplectic_euler is stable at' in line and 'rad/s' in line
+
+    def alarm() -> Any:
+        of_it()
+        status = tool.status()
+        return status if status and status.level == DiagnosticStatus.ERROR else None
+
+    assert 'a frame was taken back: a node would have moved' in wait_for(alarm, 'ERROR').message
+    wait_until_felt(tool)
+
+
+def test_a_tool_that_jumps_is_felt_no_more_and_the_log_says_why(tool: Tool, tmp_path: Path) -> None:
+    wait_until_felt(tool)
     jump = tool.sequence + 1
 
     def after_the_jump() -> Any:
@@ -98,9 +143,4 @@ def test_a_tool_that_jumps_is_felt_no_more_and_the_log_says_why(tool: Tool, tmp_
         lambda: 'the tool has moved by 297 mm within a frame' in (tmp_path / 'log').read_text(),
         'the reason',
     )
-
-    def felt_again() -> Any:
-        sample = tool.at(0.002)
-        return sample is not None and sample.force[2] > 0.03
-
-    wait_for(felt_again, 'a force')
+    wait_until_felt(tool)

@@ -7,15 +7,18 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from live import ROOT, free_domain
 
 from session.graph import PROFILES, RANGE, discovery, node_environment
+from session.network import Network, network_environment
 
 pytestmark = pytest.mark.real_time
 
+DDS = '{http://www.eprosima.com}'
 FREEZES, FROZEN = 40, 0.25
 """A process that is stopped, or killed, at a random moment may hold a lock."""
 TALK = """
@@ -124,3 +127,28 @@ def test_shell_decides_how_far_the_nodes_reach(
     path = profile if profile.startswith('/') else str(ROOT / f'config/dds/{profile}.xml')
     assert discovery(shell) == {RANGE: asked, PROFILES: path}
     assert discovery(shell | discovery(shell)) == discovery(shell)
+
+
+def test_a_partition_adds_to_what_the_profile_says_of_writers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ('ROS_STATIC_PEERS', RANGE):
+        monkeypatch.delenv(name, raising=False)
+    with network_environment(0, Network(open=True, partition='lab_a')) as environment:
+        profiles = ElementTree.parse(environment[PROFILES]).getroot()[0]
+    for kind in ('data_writer', 'data_reader'):
+        (default,) = profiles.findall(f'{DDS}{kind}[@is_default_profile="true"]')
+        assert default.findtext(f'.//{DDS}partition//{DDS}name') == 'lab_a'
+        assert (default.find(f'{DDS}times') is not None) == (kind == 'data_writer')
+
+
+def test_peers_are_looked_for_from_within_a_program_of_the_users_own_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in (RANGE, PROFILES):
+        monkeypatch.delenv(name, raising=False)
+    within = discovery({})  # what `trainer run` gives the program
+    assert discovery(within) == within
+    assert Path(within[PROFILES]).stem == 'localhost'
+    asked = Network(peers=('192.168.1.20',)).variables(within)
+    assert (asked[RANGE], Path(asked[PROFILES]).stem) == ('SUBNET', 'network')

@@ -1,14 +1,14 @@
 """Claims about the markers for RViz and Foxglove, decoded by the classes of their messages."""
 
-import json
-from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from meshes import box
 from rclpy.serialization import deserialize_message
-from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 from strokes import draw, mesh_of, method_named, straight
 from visualization_msgs.msg import Marker, MarkerArray
@@ -17,13 +17,13 @@ from haptic_bridge.chain import TOUCHING
 from haptic_bridge.settings import DeviceSettings
 from tissue_sim.messages import mesh_message
 from tissue_sim.replica import MeshReplica
-from tissue_sim.ros import ARM, CONTACT, DIAGNOSTICS, FRAME, MARKERS
-from viewer.frames import device_frame
-from viewer.markers import Markers, shades, von_mises
+from tissue_sim.ros import LATCHED, STATIC_FRAMES
+from viewer import frames
+from viewer.frames import StaticFrames, device_frame, publishing_command
+from viewer.markers import Colouring, Markers, shades, von_mises
 from viewer.moment import Moment
-from viewer.stage import METRES_A_NEWTON
+from viewer.stage import METRES_A_NEWTON, OPENED
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config'
 LARGEST = 0.004
 STAMP = 12_000_000_034
 E, NU = 5400.0, 0.45
@@ -56,8 +56,13 @@ def moment() -> Moment:
     )
 
 
-def decoded(replica: MeshReplica, moment: Moment | None) -> dict[str, Marker]:
-    data = Markers('tissue', 'displacement', LARGEST, E, NU).array(replica, moment, 0.004, STAMP)
+def decoded(
+    replica: MeshReplica,
+    moment: Moment | None,
+    colouring: Colouring = 'displacement',
+    largest: float = LARGEST,
+) -> dict[str, Marker]:
+    data = Markers('tissue', colouring, largest, E, NU).array(replica, moment, 0.004, STAMP)
     return {marker.ns: marker for marker in deserialize_message(data, MarkerArray).markers}
 
 
@@ -81,6 +86,23 @@ def test_colour_of_the_tissue_is_its_displacement(replica, moment):
     np.testing.assert_array_equal(colours, shades(lengths / LARGEST))
     assert len(np.unique(colours, axis=0)) > 3
     assert (colours[:, 3] == 1).all()
+
+
+def test_colour_of_the_tissue_is_its_stress_where_that_is_asked_for(replica, moment):
+    corners = replica.triangles[replica.triangle_kind == 0].ravel()
+    stress = von_mises(replica, E, NU)[corners]
+    for largest, last in ((1000.0, 1000.0), (0.0, E / 10)):
+        marker = decoded(replica, moment, 'von_mises', largest)['tissue']
+        colours = np.array([(c.r, c.g, c.b, c.a) for c in marker.colors])
+        np.testing.assert_array_equal(colours, shades(stress / last))
+        assert len(np.unique(colours, axis=0)) > 3
+
+
+def test_cut_surface_has_one_colour_of_its_own(replica, moment):
+    markers = decoded(replica, moment)
+    assert not markers['cut'].colors and len(markers['cut'].points) > 0
+    cut = markers['cut'].color
+    assert (cut.r, cut.g, cut.b, cut.a) == pytest.approx((*(c / 255 for c in OPENED), 1))
 
 
 def test_every_marker_is_in_the_frame_of_the_tissue_and_of_one_time(replica, moment):
@@ -141,19 +163,54 @@ def test_frame_of_the_device_maps_its_points_to_the_tissue():
     np.testing.assert_allclose(mapped, device.tissue_from_device.to_tissue(point), atol=1e-12)
 
 
-def test_layouts_that_are_shipped_name_what_is_published():
-    rviz = YAML(typ='safe').load(CONFIG / 'rviz' / 'trainer.rviz')['Visualization Manager']
-    shown = {display['Name']: display for display in rviz['Displays']}
-    markers = shown['Tissue and tool']
-    assert rviz['Global Options']['Fixed Frame'] == FRAME
-    assert markers['Topic']['Value'] == f'/{MARKERS}'
-    assert set(markers['Namespaces']) == {'tissue', 'cut', 'tool', 'proxy', 'force'}
-    layout = json.loads((CONFIG / 'foxglove' / 'trainer.json').read_text())['configById']
-    scene = layout['3D!tissue']
-    assert scene['followTf'] == FRAME
-    topics = set(scene['topics'])
-    for panel in layout.values():
-        topics |= {path['value'].partition('.')[0] for path in panel.get('paths', [])}
-    published = {f'/{MARKERS}', f'/{CONTACT}', f'/{ARM}/servo_cf', f'/{ARM}/measured_cp'}
-    assert topics == published
-    assert layout['DiagnosticSummary!nodes']['topicToRender'] == DIAGNOSTICS
+class Talker:
+    """A node, as far as static frames need one."""
+
+    def __init__(self) -> None:
+        self.published: list[Any] = []
+        self.said: list[str] = []
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(info=self.said.append)
+
+    def get_clock(self) -> Any:
+        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time))
+
+    def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
+        assert (topic, qos) == (STATIC_FRAMES, LATCHED)
+        return SimpleNamespace(publish=lambda message: self.published.append(message.transforms))
+
+
+def placed(x: float) -> DeviceSettings:
+    return DeviceSettings.model_validate({'tissue_from_device': {'translation': (x, 0.0, 0.06)}})
+
+
+def test_static_frames_are_those_of_the_drivers_poses_and_of_the_scene_that_runs(monkeypatch):
+    monkeypatch.setattr(frames, 'TFMessage', SimpleNamespace)
+    talker: Any = Talker()
+    static = StaticFrames(talker, placed(0.0))
+    for name in ('arm_base', 'tissue', '', 'MTML_base', 'MTML_base'):
+        static.learn(name)
+    static.place(placed(0.1))
+    said = [
+        [(t.header.frame_id, t.child_frame_id, t.transform.translation.x) for t in transforms]
+        for transforms in talker.published
+    ]
+    both = ('MTML_base', 'arm_base')
+    assert said[0] == [('tissue', 'arm_base', 0.0)]
+    assert said[1:] == [[('tissue', name, x) for name in both] for x in (0.0, 0.1)]
+
+
+def test_without_tf2_msgs_the_viewer_says_what_publishes_the_frame(monkeypatch):
+    monkeypatch.setattr(frames, 'TFMessage', None)
+    talker: Any = Talker()
+    StaticFrames(talker, placed(0.1)).learn('MTML_base')
+    (said,) = talker.said
+    assert said.endswith(publishing_command(device_frame(placed(0.1))))
+    words = said[said.index('ros2 run tf2_ros static_transform_publisher') :].split()
+    given = dict(zip(words[4::2], words[5::2], strict=True))
+    assert given == {
+        **{'--x': '0.1', '--y': '0', '--z': '0.06'},
+        **{'--qx': '0', '--qy': '0', '--qz': '0', '--qw': '1'},
+        **{'--frame-id': 'tissue', '--child-frame-id': 'arm_base'},
+    }

@@ -1,14 +1,11 @@
 """Claims about the page of a live session, made with a browser as a person would use it.
 
-One session: look, record, start, press with the blade, stop at once, start again, cut, reload.
+One session: look, record, start, press with the blade, stop at once, start again, cut,
+reload.
 """
 
-import json
 import os
-import re
-import signal
-import subprocess
-import sys
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,6 +15,17 @@ from typing import Any
 import numpy as np
 import pytest
 from live import MEASURED_CP, SERVO_CF, Recording, two_presses, write_scene
+from page_user import (
+    RIGHT,
+    UP,
+    Eye,
+    View,
+    cut_coloured,
+    reddish,
+    sessions,
+    start,
+    way,
+)
 
 from bench.browser import CHROMIUM, NO_CARD, Browser, Page, chromium
 from haptic_bridge.chain import INSIDE, TOUCHING
@@ -25,7 +33,6 @@ from haptic_bridge.operating_state import E_STOP
 from haptic_bridge.wire import ContactCodec
 from session.scene import load_scene
 from tissue_sim.assembly import make_simulation
-from viewer.stage import FIELD_OF_VIEW, framing
 
 pytestmark = [
     pytest.mark.slow,
@@ -35,14 +42,14 @@ pytestmark = [
     ),
 ]
 
-ROOT = Path(__file__).resolve().parents[1]
-GRIP = 0.028
-"""[m] from the tip to where the arrows of the handles are gripped."""
 PRESS, DOWN, ALONG = 0.0180, 0.025, 0.026
 """[m] that the blade is dragged: to press on a block that is 10 mm high, 9 mm into it, along it."""
-UP = np.array([0.0, 0.0, 1.0])
-
-
+RECORDING = (
+    "[...document.querySelectorAll('button:enabled')].some(b => /^Stop r/.test(b.innerText))"
+)
+STOP = """(r => [r.x, r.y, r.width, r.height].join(' '))(
+    [...document.querySelectorAll('button')].find(b => b.innerText.trim() === 'E-STOP')
+    .getBoundingClientRect())"""
 FORCE_PLOT = np.s_[96:196, 62:292]
 """Where the page has the line of the force [pixel]."""
 
@@ -54,97 +61,11 @@ class Seen:
     pictures: dict[str, np.ndarray] = field(default_factory=dict)
     plots: dict[str, np.ndarray] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
+    stops: dict[str, str] = field(default_factory=dict)
     requests: list[str] = field(default_factory=list)
-    bag: Path = Path()
+    known: set[Path] = field(default_factory=sessions)
+    bags: list[Path] = field(default_factory=list)
     status: int = -1
-
-
-class View:
-    """`trainer view` as a process of its own."""
-
-    def __init__(self, folder: Path, scene: Path) -> None:
-        self._said = folder / 'said'
-        command = [sys.executable, '-m', 'session.cli', 'view', '--port', '0']
-        with self._said.open('wb') as file:
-            self.process = subprocess.Popen(
-                [*command, '--scene', str(scene), '--domain', 'free'],
-                cwd=ROOT,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {'COLUMNS': '200'},
-                start_new_session=True,
-            )
-
-    def url(self) -> str:
-        """Where the page is, once all nodes are ready."""
-        deadline = time.monotonic() + 120
-        while self._said.read_text().count(' is ready') < 5:
-            assert self.process.poll() is None and time.monotonic() < deadline, self.said
-            time.sleep(0.1)
-        found = re.search(r'page: (http://127\.0\.0\.1:\d+)$', self.said, re.MULTILINE)
-        assert found, self.said
-        return found[1]
-
-    @property
-    def said(self) -> str:
-        return self._said.read_text()
-
-    def end(self) -> int:
-        self.process.send_signal(signal.SIGINT)
-        return self.process.wait(60)
-
-
-class Eye:
-    """Where points of the tissue frame are on the page, for its first camera."""
-
-    def __init__(self, page: Page, positions: np.ndarray) -> None:
-        position, aim = framing(positions)
-        forward = (aim - position) / np.linalg.norm(aim - position)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        self._position = position
-        self._axes = np.stack([right, np.cross(right, forward), forward])
-        box = "document.querySelector('canvas').getBoundingClientRect()"
-        found = page.evaluate(f'(r => JSON.stringify([r.x, r.y, r.width, r.height]))({box})')
-        self.box = np.array(json.loads(found))
-
-    def pixels(self, points: np.ndarray) -> np.ndarray:
-        x, y, depth = self._axes @ (np.asarray(points) - self._position).T
-        scale = self.box[3] / 2 / np.tan(FIELD_OF_VIEW / 2)
-        middle = self.box[:2] + self.box[2:] / 2
-        return middle + scale * np.stack([x / depth, -y / depth], axis=1)
-
-
-def way(start: np.ndarray, axis: np.ndarray, length: float) -> np.ndarray:
-    """Places from a grip on the arrow along an axis to `length` further [m], shape (n, 3)."""
-    shares = np.concatenate([[0.0, 0.02], np.linspace(0.05, 1.0, 40)])
-    return start + np.outer(GRIP + shares * length, axis)
-
-
-def reddish(picture: np.ndarray) -> np.ndarray:
-    """Which pixels have the colour of tissue."""
-    r, g, b = picture.astype(int).transpose(2, 0, 1)
-    return (r > g + 25) & (r > b + 25) & (abs(g - b) < 60)
-
-
-def cut_coloured(picture: np.ndarray) -> np.ndarray:
-    """Which pixels have the colour of what a cut has opened."""
-    r, g, b = picture.astype(int).transpose(2, 0, 1)
-    return (r > 3 * g) & (r > 2 * b) & (r > 40)
-
-
-def start(page: Page) -> None:
-    """Lets the force in; again where a machine that stood still has made a fault."""
-    for _ in range(10):
-        if not page.says('Force is on'):
-            page.click('Start')
-        deadline = time.monotonic() + 3.0
-        while time.monotonic() < deadline:
-            if page.says('Force is on'):
-                return
-            time.sleep(0.1)
-    raise AssertionError(page.evaluate('document.body.innerText'))
 
 
 def height_of_line(plot: np.ndarray) -> int:
@@ -175,46 +96,54 @@ def use(browser: Browser, url: str, file: Path, seen: Seen) -> None:
             before = now
         return now.astype(np.uint8)
 
-    def keep(name: str) -> None:
+    def keep(name: str, *, picture: bool = True) -> None:
         print(f'{time.monotonic() - began:.1f} s: {name}', flush=True)
         seen.texts[name] = page.evaluate('document.body.innerText')
-        seen.pictures[name] = settle()
+        seen.stops[name] = page.evaluate(STOP)
+        if picture:
+            seen.pictures[name] = settle()
         seen.plots[name] = page.picture()[FORCE_PLOT]
         if folder := os.environ.get('PICTURES'):
             page.save(Path(folder) / f'{name}.png')
+
+    def drag(points: np.ndarray) -> None:
+        start(page)
+        page.wait(lambda: page.says('Drag the handles'), 'the handles')
+        time.sleep(1.0)
+        page.drag(eye.pixels(points))
 
     page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue')
     page.evaluate(NO_CARD)
     keep('before')
     page.click('Record')
-    page.wait(lambda: page.says('Stop recording'), 'the recorder')
-    start(page)
-    page.wait(lambda: page.says('Drag the handles'), 'the handles')
-    settle()
+    wait_for_bag(page, seen)
     tip = np.array(scene.arm.script.start.position)
-    page.drag(eye.pixels(way(tip, UP, -PRESS)))
-    keep('pressed')
+    drag(way(tip, UP, -PRESS))
+    keep('pressed', picture=False)
     start(page)
-    settle()
+    time.sleep(1.5)
     page.click('E-STOP')
     page.wait(lambda: page.says('emergency stop'), 'the stop')
-    keep('stopped')
-    start(page)
-    page.wait(lambda: page.says('Drag the handles'), 'the handles')
-    settle()
-    page.drag(eye.pixels(way(tip - PRESS * UP, UP, PRESS - DOWN)))
-    start(page)
-    settle()
-    page.drag(eye.pixels(way(tip - DOWN * UP, np.array([1.0, 0.0, 0.0]), ALONG)))
+    keep('stopped', picture=False)
+    drag(way(tip - PRESS * UP, UP, PRESS - DOWN))
+    drag(way(tip - DOWN * UP, RIGHT, ALONG))
     keep('cut')
-    page.open(url)
+    page.reload()
     page.wait(lambda: page.says('Start'), 'the page again')
     page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue again')
     page.evaluate(NO_CARD)
     keep('reloaded')
     page.click('Stop recording')
     page.wait(lambda: page.says('Record') and not page.says('Stop recording'), 'the end of the bag')
+    print(f'{time.monotonic() - began:.1f} s: ended', flush=True)
     seen.requests = page.requests
+
+
+def wait_for_bag(page: Page, seen: Seen) -> None:
+    """Returns when one more bag is being made, and all nodes are there."""
+    page.wait(lambda: sessions() - seen.known - set(seen.bags), 'the next bag')
+    seen.bags += sessions() - seen.known - set(seen.bags)
+    page.wait(lambda: page.evaluate(RECORDING), 'the nodes')
 
 
 @pytest.fixture(scope='module')
@@ -223,24 +152,23 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
     folder = tmp_path_factory.mktemp('view')
     scene = write_scene(folder, two_presses(), 20.0, cut_threshold=0.6)
     view = View(folder, scene)
-    known = set((ROOT / 'bags' / 'sessions').glob('*'))
     try:
         url = view.url()
         with chromium((1060, 640), coarseness=2) as browser:
             use(browser, url, scene, seen)
-        (seen.bag,) = set((ROOT / 'bags' / 'sessions').glob('*')) - known
         seen.status = view.end()
     finally:
         print(view.said)
         if view.process.poll() is None:
             view.end()
     yield seen
-    subprocess.run(['rm', '-r', str(seen.bag)], check=True)
+    for bag in seen.bags:
+        shutil.rmtree(bag)
 
 
 @pytest.fixture(scope='module')
 def recording(seen: Seen) -> Recording:
-    return Recording(seen.bag)
+    return Recording(seen.bags[0])
 
 
 def test_view_ends_in_order_on_ctrl_c(seen: Seen) -> None:
@@ -284,21 +212,22 @@ def test_a_reload_in_mid_session_shows_the_same_again(seen: Seen) -> None:
 
 
 def test_e_stop_is_zero_force_and_fault_within_50_ms(recording: Recording) -> None:
-    commands = [
-        (recording.bag.read(m).string, m.publish_time)
-        for m in recording.messages('/haptic_bridge/state_command')
-    ]
-    clicked = recording.at(next(stamp for word, stamp in commands if word == E_STOP))
+    said = commands(recording)
+    clicked = next(time for word, time in said if word == E_STOP)
     times, norms = recording.force(SERVO_CF)
     assert norms[(times > clicked - 0.1) & (times <= clicked)].max() > 0
-    later = [recording.at(stamp) for word, stamp in commands if word == 'enable']
-    again = min(time for time in later if time > clicked)
+    again = min(time for word, time in said if word == 'enable' and time > clicked)
     assert not norms[(times > clicked + 0.05) & (times < again)].any()
     states: list[tuple[str, float]] = []
     for message in recording.messages('/haptic_bridge/operating_state'):
         states.append((recording.bag.read(message).state, recording.at(message.publish_time)))
     fault = next(time for state, time in states if state == 'FAULT' and time > clicked)
     assert fault - clicked < 0.05
+
+
+def test_e_stop_stays_where_it_is_whatever_the_page_has_to_say(seen: Seen) -> None:
+    assert 'emergency stop' in seen.texts['stopped']
+    assert len(set(seen.stops.values())) == 1
 
 
 def test_hand_went_where_the_blade_was_dragged(recording: Recording) -> None:
@@ -308,3 +237,11 @@ def test_hand_went_where_the_blade_was_dragged(recording: Recording) -> None:
     assert moved[2] < -0.6 * DOWN
     assert moved[0] > 0.6 * ALONG
     assert abs(moved[1]) < 0.01
+
+
+def commands(recording: Recording) -> list[tuple[str, float]]:
+    """What the haptic bridge was told, and when [s]."""
+    return [
+        (recording.bag.read(m).string, recording.at(m.publish_time))
+        for m in recording.messages('/haptic_bridge/state_command')
+    ]

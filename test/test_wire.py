@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cutting_trainer_msgs.msg import Contact, ForceSample
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -52,7 +52,6 @@ def flat(message):
 
 
 @pytest.mark.parametrize('codec', CODECS, ids=lambda c: c.__name__)
-@settings(deadline=None)
 @given(st.data())
 def test_rclpy_reads_what_is_written_and_the_other_way_round(codec, data):
     stamp, frame, values = data.draw(STAMPS), data.draw(FRAMES), data.draw(values_of(codec))

@@ -14,12 +14,13 @@ from numba import njit
 
 from tissue_sim.coupling import FREE, Coupling
 from tissue_sim.elasticity import ElasticModel, Operands, internal_force
-from tissue_sim.rotation import LANES
+from tissue_sim.mesh import grown
+from tissue_sim.rings import intervals, without
 
 _BLOCK = 4
 """Substeps between two choices while some nodes sleep."""
 _BLOCK_AWAKE = 16
-"""The same while none does, and none can be missed."""
+"""The same while none does, or as many move as may: a new choice would change little."""
 _RINGS = 2
 """Neighbours of neighbours that a moving node keeps awake."""
 _PATIENCE = 6
@@ -42,53 +43,37 @@ class ActiveSettings:
 
 
 class Region(NamedTuple):
-    """Intervals of nodes that move, shape (s, 2), and the operands that they need."""
+    """Nodes that move.
+
+    Attributes:
+        spans: their intervals, shape (s, 2).
+        operands: for the force on them.
+        around: for the force on them and their neighbours.
+    """
 
     spans: np.ndarray
     operands: Operands
+    around: Operands
 
 
 @njit(cache=True)
-def _spread(tetrahedra, marked):
-    """Marks all nodes of the elements that have a marked one."""
-    before = marked.copy()
-    for t in range(tetrahedra.shape[0]):
-        any_marked = False
-        for i in range(4):
-            any_marked = any_marked or before[tetrahedra[t, i]]
-        if any_marked:
-            for i in range(4):
-                marked[tetrahedra[t, i]] = True
+def _ahead(reach, u, v, beta, out):
+    """Puts u + beta v, which the force is taken at, in some intervals of nodes."""
+    for s in range(reach.shape[0]):
+        for i in range(3 * reach[s, 0], 3 * reach[s, 1]):
+            out[i] = u[i] + beta * v[i]
 
 
 @njit(cache=True)
 def _measure(f, v, inverse_mass, seconds, tolerance, looked, quiet):
     """Counts for how many choices the nodes that are looked at have been slow and in balance."""
-    for i in range(quiet.shape[0]):
-        if not looked[i]:
-            continue
+    for i in looked:
         speed = gain = 0.0
         for k in range(3 * i, 3 * i + 3):
             speed += v[k] * v[k]
             gain += (f[k] * inverse_mass[k] * seconds) ** 2
         slow = max(speed, gain) < tolerance * tolerance
         quiet[i] = min(quiet[i] + 1, 1000) if slow else 0
-
-
-@njit(cache=True)
-def _chunks(tetrahedra, marked):
-    """Which chunks of elements have one with a marked node."""
-    out = np.zeros((tetrahedra.shape[0] + LANES - 1) // LANES, np.bool_)
-    for t in range(tetrahedra.shape[0]):
-        for i in range(4):
-            if marked[tetrahedra[t, i]]:
-                out[t // LANES] = True
-    return np.flatnonzero(out)
-
-
-def _spans(marked: np.ndarray) -> np.ndarray:
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
-    return ends.reshape(-1, 2)
 
 
 class ActiveRegion:
@@ -105,14 +90,31 @@ class ActiveRegion:
         self._settings = settings
         self._implicit = implicit
         self._rings = 4 * _RINGS if implicit else _RINGS
-        self._quiet = np.zeros(model.mesh.node_count, np.int64)
-        self._awake = np.ones(model.mesh.node_count, bool)
-        self._near = self._awake
+        n = model.mesh.node_count
+        self._quiet = np.zeros(n, np.int64)
+        self._awake = self._near = np.arange(n)
+        self._region: Region | None = None
+        self._moved = np.zeros(n, bool)
+        self._scratch = np.zeros((2, 0))
 
     @property
     def count(self) -> int:
         """How many nodes move."""
-        return int(self._awake.sum())
+        return len(self._awake)
+
+    @property
+    def whole(self) -> bool:
+        """Whether all nodes move, whatever they do."""
+        return self._settings.mode == 'off'
+
+    def moved(self) -> np.ndarray:
+        """The nodes that have moved since this was last asked, sorted, shape (a,)."""
+        n = self._model.mesh.node_count
+        self._moved = grown(self._moved, n)
+        self._moved[self._awake] = True
+        out = np.flatnonzero(self._moved[:n])
+        self._moved[:] = False
+        return out
 
     def ahead(self, left: int) -> int:
         """Substeps until the next choice, of some that are left in the frame."""
@@ -120,12 +122,16 @@ class ActiveRegion:
             return left
         if self._implicit:
             return 1
-        return min(_BLOCK_AWAKE if self._awake.all() else _BLOCK, left)
+        most = self._model.mesh.node_count
+        if self._settings.mode == 'budget':
+            most = min(most, self._settings.nodes)
+        return min(_BLOCK_AWAKE if self.count >= most else _BLOCK, left)
 
     def choose(
         self,
-        damped: np.ndarray,
+        u: np.ndarray,
         v: np.ndarray,
+        beta: float,
         inverse_mass: np.ndarray,
         coupling: Coupling,
         seconds: float,
@@ -133,72 +139,90 @@ class ActiveRegion:
         """Chooses, and stops the nodes that go to sleep.
 
         Only nodes that move, and their neighbours, are looked at: the force on others is what it
-        was.
+        was. The cost is theirs, whatever the size of the tissue.
 
         Args:
-            damped: u + beta v, which the force is taken at [m], shape (3 n,).
+            u: displacement [m], shape (3 n,).
             v: velocity [m/s], changed where nodes go to sleep, shape (3 n,).
+            beta: damping in proportion to stiffness [s].
             inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
             coupling: the tool's spring.
             seconds: duration of a frame [s].
         """
-        n = self._model.mesh.node_count
-        whole = self._model.operands()
-        if self._settings.mode == 'off':
-            return Region(whole.awake, whole)
-        tetrahedra = self._model.mesh.tetrahedra
-        looked = self._near.copy()
-        looked[coupling.nodes] = True
-        f = np.empty(3 * n)
-        if looked.all():
-            internal_force(whole, damped, f, 1)
-        else:
-            around = looked.copy()
-            _spread(tetrahedra, around)
-            internal_force(self._needed(looked, around), damped, f, 1)
+        if self.whole:
+            operands = self._model.operands()
+            return Region(operands.awake, operands, operands)
+        looked, operands = self._looked(coupling)
+        damped, f = self._room(len(u))
+        _ahead(operands.reach, u, v, beta, damped)
+        internal_force(operands, damped, f, 1)
         tolerance = self._settings.tolerance
         _measure(f, v, inverse_mass, seconds, tolerance, looked, self._quiet)
-        awake = self._quiet < _PATIENCE
-        awake[coupling.nodes] = True
-        for _ in range(self._rings):
-            _spread(tetrahedra, awake)
-        if self._settings.mode == 'budget' and awake.sum() > self._settings.nodes:
-            awake = self._nearest(awake, v, coupling)
-            self._quiet[~awake] = _PATIENCE  # they sleep: their neighbours may wake them
-        v.reshape(-1, 3)[~awake] = 0.0
-        self._awake = awake
-        self._near = awake.copy()
-        _spread(tetrahedra, self._near)
-        if awake.all():
-            return Region(whole.awake, whole)
-        return Region(_spans(awake), self._needed(awake, self._near))
+        restless = looked[self._quiet[looked] < _PATIENCE]
+        seeds = np.concatenate([restless, coupling.nodes])
+        awake = self._model.neighbours.around(seeds, self._rings)
+        if self._settings.mode == 'budget' and len(awake) > self._settings.nodes:
+            candidates, awake = awake, self._nearest(awake, v, coupling)
+            # The others sleep: their neighbours may wake them.
+            self._quiet[without(candidates, awake)] = _PATIENCE
+        v.reshape(-1, 3)[without(self._awake, awake)] = 0.0
+        if self._region is None or not np.array_equal(awake, self._awake):
+            self._region = self._surround(awake)
+        self._moved = grown(self._moved, self._model.mesh.node_count)
+        self._moved[awake] = True
+        return self._region
 
-    def _needed(self, marked: np.ndarray, near: np.ndarray) -> Operands:
-        """What the forces on marked nodes need; `near`: they and their neighbours, shape (n,)."""
-        chunks = np.zeros(0, np.int64)
-        if self._model.rotating:
-            chunks = _chunks(self._model.mesh.tetrahedra, marked)
-        return self._model.operands(_spans(near), chunks)
+    def _looked(self, coupling: Coupling) -> tuple[np.ndarray, Operands]:
+        """The nodes that are looked at, sorted, and the operands for the force on them."""
+        region = self._region
+        if region is not None and len(without(np.sort(coupling.nodes), self._near)) == 0:
+            return self._near, region.around
+        neighbours = self._model.neighbours
+        looked = neighbours.around(np.concatenate([self._near, coupling.nodes]), 0)
+        whole = len(looked) == self._model.mesh.node_count
+        return looked, self._model.operands(None if whole else looked)
+
+    def _surround(self, awake: np.ndarray) -> Region:
+        """Takes some nodes as those that move, sorted, shape (a,)."""
+        model = self._model
+        level = model.neighbours.levels(awake, 3)
+        self._awake, self._near = awake, np.flatnonzero(level <= 1)
+        n = model.mesh.node_count
+        inner = model.operands() if len(awake) == n else model.operands_within(level, 0)
+        outer = inner if len(self._near) == n else model.operands_within(level, 1)
+        return Region(intervals(level, 0), inner, outer)
+
+    def _room(self, size: int) -> np.ndarray:
+        if self._scratch.shape[1] != size:
+            self._scratch = np.zeros((2, size))
+        return self._scratch
 
     def _nearest(self, awake: np.ndarray, v: np.ndarray, coupling: Coupling) -> np.ndarray:
-        """Of the nodes awake those nearest to the tool; without a tool the fastest."""
+        """Of the nodes awake those nearest to the tool; without a tool the fastest; sorted."""
         rest = self._model.mesh.rest
         if coupling.mode == FREE:
-            rank = -np.square(v.reshape(-1, 3)).sum(axis=1)
+            rank = -np.square(v.reshape(-1, 3)[awake]).sum(axis=1)
         else:
-            rank = np.square(rest - coupling.weights @ rest[coupling.nodes]).sum(axis=1)
-        candidates = np.flatnonzero(awake)
-        order = np.argsort(rank[candidates], kind='stable')
-        out = np.zeros_like(awake)
-        out[candidates[order[: self._settings.nodes]]] = True
-        return out
+            here = coupling.weights @ rest[coupling.nodes]
+            rank = np.square(rest[awake] - here).sum(axis=1)
+        most = self._settings.nodes
+        return np.sort(awake[np.argpartition(rank, most - 1)[:most]])
 
     def follow_cut(self, nodes: np.ndarray) -> None:
         """Wakes the nodes that a cut touched, shape (r,)."""
         n = self._model.mesh.node_count
-        quiet = np.zeros(n, np.int64)
-        known = min(n, len(self._quiet))
-        quiet[:known] = self._quiet[:known]
-        quiet[nodes] = 0
-        self._quiet = quiet
-        self._awake = self._near = np.ones(n, bool)
+        if self.whole:
+            self._awake = np.arange(n)
+            return
+        self._quiet = grown(self._quiet, n)
+        self._quiet[nodes] = 0
+        awake = np.concatenate([self._awake[self._awake < n], nodes])
+        self._awake = self._model.neighbours.around(awake, 0)
+        self._near = self._model.neighbours.around(awake, 1)
+        self._region = None
+
+    def wake(self) -> None:
+        """Wakes all nodes."""
+        self._awake = self._near = np.arange(self._model.mesh.node_count)
+        self._quiet[:] = 0
+        self._region = None

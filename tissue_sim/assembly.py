@@ -1,5 +1,7 @@
 """From what a scene says of its tissue to the tissue."""
 
+from dataclasses import asdict, replace
+
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
 from tissue_sim.candidate import Task
@@ -8,7 +10,8 @@ from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.mesh_io import load_tissue
 from tissue_sim.plan import Plan, plan
-from tissue_sim.settings import TissueSettings
+from tissue_sim.replica import MeshReplica
+from tissue_sim.settings import ActiveRegion, TissueSettings
 from tissue_sim.simulation import TissueSimulation
 from tissue_sim.warm_up import warm_up
 
@@ -37,13 +40,16 @@ def make_task(settings: TissueSettings) -> Task:
     )
 
 
-def make_simulation(settings: TissueSettings) -> tuple[TissueSimulation, Plan | None]:
+def make_simulation(
+    settings: TissueSettings, before: MeshReplica | None = None
+) -> tuple[TissueSimulation, Plan | None]:
     """The simulation that a scene describes, and the plan it goes by if it asks for one.
 
     Where no method fits the budget, the scene's own model, integrator and active region are taken.
 
     Args:
         settings: its section `tissue`.
+        before: the tissue as another simulation of this scene left it, to go on from.
 
     Raises:
         MeshError: the mesh cannot be used.
@@ -53,17 +59,31 @@ def make_simulation(settings: TissueSettings) -> tuple[TissueSimulation, Plan | 
     warm_up()
     task = make_task(settings)
     found = plan(task) if settings.method == 'auto' else None
-    model, stepping = settings.model, task.stepping
-    active = ActiveSettings(**settings.active_region.model_dump())
-    if found is not None and found.chosen is not None:
-        model, stepping, active = found.chosen.model, found.stepping, found.chosen.active
+    taken = as_planned(settings, found)
     simulation = TissueSimulation(
-        task.mesh,
+        task.mesh if before is None else before.mesh(),
         task.material,
         task.resistance,
-        model=model,
-        stepping=stepping,
-        active=active,
-        stretch=settings.stretch,
+        model=taken.model,
+        stepping=replace(task.stepping, integrator=taken.integrator),
+        active=ActiveSettings(**taken.active_region.model_dump()),
+        stretch=settings.stretch if before is None else (0.0, 0.0, 0.0),
     )
+    if before is not None:
+        simulation.resume(before.displacement, before.step)
     return simulation, found
+
+
+def as_planned(settings: TissueSettings, found: Plan | None) -> TissueSettings:
+    """The scene with the method that its simulation takes, given and not to be planned any more.
+
+    Args:
+        settings: its section `tissue`.
+        found: by the plan, if the scene asks for one.
+    """
+    method: dict[str, object] = {'method': 'given'}
+    if found is not None and found.chosen is not None:
+        chosen = found.chosen
+        method |= {'model': chosen.model, 'integrator': chosen.integrator}
+        method['active_region'] = ActiveRegion(**asdict(chosen.active))
+    return settings.model_copy(update=method)

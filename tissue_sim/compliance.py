@@ -5,9 +5,12 @@ from numba import njit
 
 from tissue_sim.elasticity import ElasticModel, stiffness_product
 from tissue_sim.errors import MeshError
+from tissue_sim.rings import PATCH, spans_of, without
 
 _AT_MOST = 100_000
 """Conjugate-gradient steps of a static solution: far more than a tissue needs that is held."""
+_SETTLED = 1e-5
+"""Residual, relative to the load, at which a compliance is known: its error is of second order."""
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
@@ -45,6 +48,48 @@ def _conjugate_gradients(operands, preconditioner, b, x, work, steps, least):
         rho = after
 
 
+@njit(cache=True, fastmath=True, error_model='numpy')
+def _patch_gradients(operands, spans, preconditioner, b, x, work, steps, least):
+    """The same with all nodes outside of some intervals held, at the cost of those inside.
+
+    Apart from the other, whose sums over all coordinates in one loop recorded sessions have.
+
+    Args:
+        spans: intervals of nodes, shape (s, 2); x is 0 outside of them.
+    """
+    r, p, q = work[0], work[1], work[2]
+    for s in range(operands.reach.shape[0]):
+        p[3 * operands.reach[s, 0] : 3 * operands.reach[s, 1]] = 0.0
+    stiffness_product(operands, x, q)
+    rho = 0.0
+    for s in range(spans.shape[0]):
+        for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+            r[i] = b[i] - q[i] if preconditioner[i] > 0.0 else 0.0
+            p[i] = preconditioner[i] * r[i]
+            rho += r[i] * p[i]
+    for _ in range(steps):
+        if rho <= least:
+            break
+        stiffness_product(operands, p, q)
+        curvature = 0.0
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                curvature += p[i] * q[i]
+        if curvature <= 0.0:
+            break
+        step = rho / curvature
+        after = 0.0
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                x[i] += step * p[i]
+                r[i] -= step * q[i] if preconditioner[i] > 0.0 else 0.0
+                after += preconditioner[i] * r[i] * r[i]
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                p[i] = preconditioner[i] * r[i] + after / rho * p[i]
+        rho = after
+
+
 def solve_static(
     model: ElasticModel, free: np.ndarray, load: np.ndarray, tolerance: float = 1e-12
 ) -> np.ndarray:
@@ -64,7 +109,7 @@ def solve_static(
     """
     b = np.where(free, load.ravel(), 0.0)
     x = np.zeros_like(b)
-    preconditioner = _diagonal_preconditioner(model, free)
+    preconditioner = _diagonal_preconditioner(model.diagonal, free)
     work = np.empty((3, len(b)))
     least = float(preconditioner @ np.square(b)) * tolerance**2
     left = 1.0
@@ -82,8 +127,8 @@ def solve_static(
     )
 
 
-def _diagonal_preconditioner(model: ElasticModel, free: np.ndarray) -> np.ndarray:
-    return np.where(free, 1.0 / np.maximum(model.diagonal, 1e-30), 0.0)
+def _diagonal_preconditioner(diagonal: np.ndarray, free: np.ndarray) -> np.ndarray:
+    return np.where(free, 1.0 / np.maximum(diagonal, 1e-30), 0.0)
 
 
 class PointCompliance:
@@ -91,15 +136,21 @@ class PointCompliance:
 
     The estimate is B.X + X.B - X.K X for the present X: never above the true compliance B.K^-1 B,
     equal to it in the end. The solution is kept while the contact stays near, so a few steps a
-    frame suffice.
+    frame suffice. Of a large tissue the PATCH nodes around the point yield, and the rest is held.
 
     Args:
         steps: conjugate-gradient steps a call and direction.
+
+    Attributes:
+        calls: since connectivity or number of directions last changed.
     """
 
     def __init__(self, steps: int = 12) -> None:
+        self.calls = 0
         self._steps = steps
         self._x = np.zeros((0, 0))
+        self._held = np.zeros((0, 0))
+        self._patch = np.zeros(0, np.int64)
         self._topology = -1
 
     def estimate(
@@ -122,18 +173,37 @@ class PointCompliance:
             Displacement along axis i for 1 N along axis j [m/N], positive semidefinite,
             shape (d, d).
         """
-        size = 3 * model.mesh.node_count
-        if model.mesh.topology != self._topology or self._x.shape != (len(axes), size):
-            self._x = np.zeros((len(axes), size))
+        n = model.mesh.node_count
+        if model.mesh.topology != self._topology or self._x.shape != (len(axes), 3 * n):
+            self._x = np.zeros((len(axes), 3 * n))
+            self._held = np.zeros((5, 3 * n))
+            self._patch = np.zeros(0, np.int64)
             self._topology = model.mesh.topology
-        loads, residuals = np.zeros((2, len(axes), size))
-        preconditioner = _diagonal_preconditioner(model, free)
-        work = np.empty((3, size))
-        for axis, b, x, r in zip(axes, loads, self._x, residuals, strict=True):
+            self.calls = 0
+        self.calls += 1
+        patch = model.neighbours.around(nodes, 0, PATCH) if n > PATCH else np.arange(n)
+        operands = model.operands(patch if len(patch) < n else None)
+        at = (3 * patch[:, None] + np.arange(3)).ravel()
+        left = without(self._patch, patch)
+        self._x.reshape(len(axes), -1, 3)[:, left] = 0.0
+        self._patch = patch
+        b, preconditioner, work = self._held[0], self._held[1], self._held[2:5]
+        preconditioner[at] = _diagonal_preconditioner(model.diagonal[at], free[at])
+        loads, residuals = np.empty((2, len(axes), len(at)))
+        spans = spans_of(patch)
+        for axis, load, x, residual in zip(axes, loads, self._x, residuals, strict=True):
+            b[at] = 0.0
             b.reshape(-1, 3)[nodes] = weights[:, None] * axis
-            b[~free] = 0.0
-            _conjugate_gradients(model.operands(), preconditioner, b, x, work, self._steps, 1e-30)
-            r[:] = work[0]
-        value = loads @ self._x.T + self._x @ residuals.T
+            b[at] = np.where(free[at], b[at], 0.0)
+            load[:] = b[at]
+            least = float(preconditioner[at] @ np.square(load)) * _SETTLED**2
+            most = self._steps, least
+            if len(patch) == n:
+                _conjugate_gradients(operands, preconditioner, b, x, work, *most)
+            else:
+                _patch_gradients(operands, spans, preconditioner, b, x, work, *most)
+            residual[:] = work[0][at]
+        x = np.ascontiguousarray(self._x[:, at])
+        value = loads @ x.T + x @ residuals.T
         sizes, vectors = np.linalg.eigh((value + value.T) / 2)
         return (vectors * np.maximum(sizes, 0.0)) @ vectors.T

@@ -2,7 +2,8 @@
 
 A dent no wider than an element is not seen by the scene's own mesh, nor is the bending of the
 whole seen from near. So both are looked at: the whole tissue on its mesh, and the elements nearest
-to the tool, each split into eight.
+to the tool, as they are and each split into eight. What splitting them changes is not over with
+once: elements twice as small yield more in a dent, those twice as small again more still.
 """
 
 from dataclasses import dataclass
@@ -50,7 +51,7 @@ class Dent:
     part: float
 
     def error(self, rotating: bool) -> float:
-        """Relative error of the settlement by a model's strain; infinite where it gives way.
+        """Relative error of the settlement by a model's strain, signed; infinite: it gives way.
 
         Args:
             rotating: whether the model's elements turn. Smoothed ones stand for plain ones.
@@ -69,11 +70,41 @@ class Dent:
         return self._error(u)
 
     def _error(self, u: Floats) -> float:
-        return self.part * abs(float(np.sum(self.load * u)) / self.depth - 1)
+        return self.part * (float(np.sum(self.load * u)) / self.depth - 1)
 
 
-def dents(mesh: TetMesh, material: Material, press: Press, depth: float) -> list[Dent]:
-    """The whole tissue, and the surroundings of the press.
+@dataclass(frozen=True)
+class Dents:
+    """The same press on the whole tissue and near it.
+
+    Attributes:
+        whole: on the mesh of the scene.
+        near, finer: of the elements around the press, and of those each split into eight.
+        steepness: depth of the dent itself, without what the whole yields, over its radius [-].
+    """
+
+    whole: Dent
+    near: Dent
+    finer: Dent
+    steepness: float
+
+    def error(self, rotating: bool) -> float:
+        """Largest relative error of the settlement by a model's strain; infinite: it gives way.
+
+        On the mesh as it is, with what finer elements near the press change, and in the limit, for
+        which a change that halves with the size of the elements is as large again.
+
+        Args:
+            rotating: whether the model's elements turn.
+        """
+        here = self.whole.error(rotating)
+        change = self.finer.error(rotating) - self.near.error(rotating)
+        largest = max(abs(here), abs(here + change), abs(here + 2 * change))
+        return largest if np.isfinite(largest) else float('inf')
+
+
+def dents(mesh: TetMesh, material: Material, press: Press, depth: float) -> Dents:
+    """Presses the whole tissue, and the surroundings of the press.
 
     Args:
         mesh: the tissue.
@@ -84,13 +115,17 @@ def dents(mesh: TetMesh, material: Material, press: Press, depth: float) -> list
     Raises:
         MeshError: there is no equilibrium as deep as that.
     """
-    near = refined(surroundings(mesh, press))
+    around = surroundings(mesh, press)
+    meshes = (mesh, around, refined(around))
     soft = [
         settlement(ElasticModel(part, material, 'linear_smoothed'), press.load(part))[0]
-        for part in (mesh, near)
+        for part in meshes
     ]
-    part = min(soft[1] / soft[0], 1.0)
-    return [_dent(mesh, material, press, depth, 1.0), _dent(near, material, press, depth, part)]
+    parts = [min(value / soft[0], 1.0) for value in soft]
+    whole, near, finer = (
+        _dent(m, material, press, depth, p) for m, p in zip(meshes, parts, strict=True)
+    )
+    return Dents(whole, near, finer, parts[2] * depth / press.radius)
 
 
 def _dent(mesh: TetMesh, material: Material, press: Press, depth: float, part: float) -> Dent:

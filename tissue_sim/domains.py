@@ -28,9 +28,7 @@ from tissue_sim.rotation import (
     stress,
     turn,
 )
-from tissue_sim.tensor_mass import shape_gradients
-
-_SLACK = 4
+from tissue_sim.tensor_mass import longer, move_row, shape_gradients
 
 
 class Domains(NamedTuple):
@@ -68,17 +66,18 @@ def _on_surface(links, node):
 
 
 @njit(cache=True)
-def gather_domains(domains, links, rest, nodes):
+def gather_domains(domains, filled, links, rest, nodes):
     """Computes the rows of some nodes from their stars; their rotations begin at none.
 
     Args:
         domains: written for `nodes` only.
+        filled: slots that are given to rows; grows with rows that move, shape (1,).
         links: connectivity.
         rest: rest positions [m], shape (n, 3).
         nodes: which rows, shape (r,).
 
     Returns:
-        Index into `nodes` of the first whose row has no room, or -1.
+        Index into `nodes` of the first for whose row the arrays are too short, or -1.
     """
     g = np.empty((4, 3))
     for which in range(len(nodes)):
@@ -101,7 +100,14 @@ def gather_domains(domains, links, rest, nodes):
                     slot += 1
                 if slot == first + used:
                     if used == domains.room[node]:
-                        return which
+                        d = domains
+                        d.used[node] = used
+                        if not move_row(
+                            d.start, d.used, d.room, d.columns, d.vectors, filled, node
+                        ):
+                            return which
+                        first = d.start[node]
+                        slot = first + used
                     used += 1
                     domains.columns[slot] = column
                     for i in range(3):
@@ -272,19 +278,21 @@ class NodeDomains:
         pairs = [tets[:, [i, j]] for i in range(4) for j in range(4)]
         both = np.concatenate(pairs)
         entries = np.unique(both[:, 0] * n + both[:, 1])
-        room = np.bincount(entries // n, minlength=n) + _SLACK
+        room = np.bincount(entries // n, minlength=n)
         slots = int(room.sum())
+        # Spare room, which costs nothing until it is used: no cut has to move it all.
+        most = 2 * slots
         self._domains = Domains(
             np.concatenate([[0], np.cumsum(room)[:-1]]),
             np.zeros(n, np.int64),
             room,
-            np.zeros(slots, np.uint32),
-            np.zeros(3 * slots),
+            np.zeros(most, np.uint32),
+            np.zeros(3 * most),
             np.zeros(n),
             np.zeros((n, 4)),
             self._lame,
         )
-        self._used = slots
+        self._filled = np.array([slots])
         self._gather(np.arange(n))
 
     def update(self, nodes: np.ndarray) -> None:
@@ -304,27 +312,21 @@ class NodeDomains:
         if len(self._domains.room) > known:
             self._domains.room[known:] = 0
         self._gather(np.asarray(nodes, np.int64))
-        if self._used > 4 * int(self._domains.used[:n].sum()) + 4096:
+        if self._filled[0] > 4 * int(self._domains.used[:n].sum()) + 4096:
             self.rebuild()
 
     def _gather(self, nodes: np.ndarray) -> None:
         while len(nodes):
-            full = gather_domains(self._domains, self._mesh.links, self._mesh.rest, nodes)
+            full = gather_domains(
+                self._domains, self._filled, self._mesh.links, self._mesh.rest, nodes
+            )
             if full < 0:
                 return
-            self._give_room(int(nodes[full]))
             nodes = nodes[full:]
-
-    def _give_room(self, node: int) -> None:
-        room = 2 * int(self._domains.room[node]) + 16
-        d = self._domains
-        self._domains = d._replace(
-            columns=grown(d.columns, self._used + room),
-            vectors=grown(d.vectors, 3 * (self._used + room)),
-        )
-        self._domains.start[node] = self._used
-        self._domains.room[node] = room
-        self._used += room
+            d = self._domains
+            size = int(self._filled[0]) + longer(int(d.room[nodes[0]]))
+            columns = grown(d.columns, size)
+            self._domains = d._replace(columns=columns, vectors=grown(d.vectors, 3 * len(columns)))
 
     @property
     def operands(self) -> Domains:

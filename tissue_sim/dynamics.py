@@ -7,18 +7,20 @@ import numpy as np
 from tissue_sim.active_region import ActiveRegion, ActiveSettings
 from tissue_sim.compliance import solve_static
 from tissue_sim.coupling import FREE, Coupling
+from tissue_sim.elastic_state import ElasticState
 from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.guard import Guard
 from tissue_sim.integrators import Integrator, IntegratorName
 from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, TopologyDelta, Touched, grown, interpolated
+from tissue_sim.mesh import TetMesh, TopologyDelta, Touched, carried_over, grown
 from tissue_sim.stability import FrequencyBound, step_bound
 
 _AT_REST = 1e-9
 """[m/s] below which a tissue that nothing touches is at rest, when it stays so."""
 _STILL_FRAMES = 10
-_FINER = 4
-_ATTEMPTS = 3
+_FINER, _FINEST = 4, 16
+"""By how much shorter steps are in the next attempt, and at most: a frame does no more work than
+21 of them, though frame after frame should need shorter steps."""
 _CAUTIOUS_FRAMES = 30
 
 
@@ -101,7 +103,8 @@ class Dynamics:
         self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
         self._bounds: dict[float, float] = {}
         self._still = 0
-        self._cut = False
+        self._elastic = ElasticState(self.model)
+        self._touched: list[np.ndarray] = []
         self._caution = 1
         self._cautious = 0
         self._guard = Guard(mesh, material.youngs_modulus)
@@ -199,8 +202,8 @@ class Dynamics:
         Args:
             coupling: the tool's spring.
         """
-        if self._cut:
-            self.restart()  # a pass over the whole tissue, which a batch must not pay for
+        if self._touched:
+            self._begin_account()  # a pass over the tissue, which a batch must not pay for
         self._frequency.refine()
         if self._cautious:
             self._cautious -= 1
@@ -208,7 +211,7 @@ class Dynamics:
         substeps, dt = self._substeps(coupling)
         before = (self._u.copy(), self._v.copy())
         trouble = ''
-        for _ in range(_ATTEMPTS):
+        while True:
             work = self._integrate(coupling, dt, substeps)
             motion = self._motion(dt, substeps, trouble)
             energy = motion.kinetic_energy + motion.elastic_energy
@@ -217,12 +220,15 @@ class Dynamics:
                 return motion
             trouble = trouble or f'{found}: {self._cause(coupling, dt)}'
             self._u, self._v = before[0].copy(), before[1].copy()
+            if self._caution * _FINER > _FINEST:
+                break
+            self._touched.append(np.arange(self.mesh.node_count))
             self._caution *= _FINER
             self._cautious = _CAUTIOUS_FRAMES
             substeps, dt = substeps * _FINER, dt / _FINER
         self._v[:] = 0.0
         self._caution = 1
-        force, elastic = self.model.evaluate(self.displacement)
+        force, elastic = self._elastic.whole(self.displacement)
         self._guard.open(elastic)
         return Motion(np.zeros_like(force), 0.0, 0.0, substeps, 0.0, trouble, diverged=True)
 
@@ -241,8 +247,9 @@ class Dynamics:
         work, done = 0.0, 0
         while done < substeps:
             region = self._active.choose(
-                self._u[:size] + self.material.beta * moving,
+                self._u[:size],
                 moving,
+                self.material.beta,
                 self.inverse_mass,
                 coupling,
                 self._frame_time,
@@ -265,9 +272,8 @@ class Dynamics:
         return work
 
     def _motion(self, dt: float, substeps: int, trouble: str) -> Motion:
-        v = self.velocity
-        force, elastic = self.model.evaluate(self.displacement)
-        kinetic = 0.5 * float(self._inertia[: len(v)] @ np.square(v).sum(axis=1))
+        force, elastic = self._elastic_now()
+        kinetic = self._kinetic_energy()
         slow = dt * substeps / self._frame_time
         return Motion(force, kinetic, elastic, substeps, slow, trouble)
 
@@ -302,28 +308,46 @@ class Dynamics:
         touched = self.mesh.apply(delta)
         self._u, self._v = grown(self._u, 3 * total), grown(self._v, 3 * total)
         for values in (self._u, self._v):
-            rows = values[: 3 * total].reshape(-1, 3)
-            new = interpolated(rows, delta.node_parents, delta.node_weights)
-            moved = interpolated(rows, delta.moved_parents, delta.moved_weights)
-            rows[n:total] = new
-            rows[np.asarray(delta.moved_nodes, np.int64)] = moved
-            for target, source in touched.renumbered:
-                rows[target] = rows[source]
+            carried_over(values[: 3 * total].reshape(-1, 3), n, delta, touched)
         self.model.update(touched)
         self._follow_cut(touched.nodes)
         return touched
+
+    def resume(self, displacement: np.ndarray) -> None:
+        """Goes on from a shape, at rest.
+
+        Args:
+            displacement: [m], shape (n, 3).
+        """
+        self.displacement[:] = displacement
+        self.velocity[:] = 0.0
+        self.restart()
 
     def restart(self) -> None:
         """Takes displacement and velocity as they are for the state that the next frame starts at.
 
         Rotations settle in it, and the account of energy begins with it.
         """
-        elastic = self.model.evaluate(self.displacement)[1]
-        v = self.velocity
-        kinetic = 0.5 * float(self._inertia[: len(v)] @ np.square(v).sum(axis=1))
-        self._guard.open(elastic + kinetic)
+        self._active.wake()
+        self._begin_account()
+
+    def _begin_account(self) -> None:
+        self._guard.open(self._elastic_now()[1] + self._kinetic_energy())
         self._still = 0
-        self._cut = False
+
+    def _elastic_now(self) -> tuple[np.ndarray, float]:
+        """Force [N], shape (n, 3), and energy [J], computed where they may have changed."""
+        if self._active.whole:
+            self._touched = []
+            return self._elastic.whole(self.displacement)
+        n, touched = self.mesh.node_count, self._touched
+        self._touched = []
+        changed = np.concatenate([self._active.moved(), *touched])
+        return self._elastic.renewed(self.displacement, changed[changed < n])
+
+    def _kinetic_energy(self) -> float:
+        v = self.velocity
+        return 0.5 * float(self._inertia[: len(v)] @ np.square(v).sum(axis=1))
 
     def _follow_cut(self, nodes: np.ndarray) -> None:
         """Brings what is kept by node up to date where a cut touched it, nodes of shape (r,)."""
@@ -337,4 +361,4 @@ class Dynamics:
         inverse = np.where(free, 1.0 / self._inertia[nodes], 0.0)
         self.inverse_mass.reshape(-1, 3)[nodes] = inverse[:, None]
         self._active.follow_cut(nodes)
-        self._cut = True
+        self._touched.append(nodes)

@@ -19,6 +19,7 @@ from tissue_sim.corotational import CorotationalElements, Elements, add_elements
 from tissue_sim.domains import Domains, NodeDomains, add_domains, add_still_domains
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, Touched, grown
+from tissue_sim.rings import Neighbours, chunks_around, intervals, nodes_of_chunks
 from tissue_sim.rotation import LANES
 from tissue_sim.tensor_mass import Rows, TensorMass, add_rows, shape_gradients
 
@@ -42,6 +43,7 @@ class Operands(NamedTuple):
         elements: corotational ones; none likewise.
         rotating: 1 if domains and elements turn with the tissue, else 0.
         awake: intervals of nodes whose rows and domains are evaluated, shape (s, 2).
+        reach: intervals of nodes that these read and write, shape (s, 2).
         chunks: of elements that are evaluated, shape (k,).
     """
 
@@ -50,6 +52,7 @@ class Operands(NamedTuple):
     elements: Elements
     rotating: int
     awake: np.ndarray
+    reach: np.ndarray
     chunks: np.ndarray
 
 
@@ -60,14 +63,15 @@ def internal_force(operands, u, f, turns):
     Args:
         operands: of the model; its rotations, if any, follow u.
         u: displacement by coordinate [m], shape (3 n,).
-        f: output [N], right at nodes all of whose neighbours are awake, shape (3 n,).
+        f: output [N], right at nodes all of whose neighbours are awake, 0 or a part of it elsewhere
+            in reach, unchanged beyond, shape (3 n,).
         turns: steps of the rotations; negative: until they have settled.
 
     Returns:
         Elastic energy of domains and elements [J].
     """
-    for i in range(f.shape[0]):
-        f[i] = 0.0
+    for s in range(operands.reach.shape[0]):
+        f[3 * operands.reach[s, 0] : 3 * operands.reach[s, 1]] = 0.0
     add_rows(operands.rows, operands.awake, u, f)
     energy = 0.0
     if operands.domains.used.shape[0] > 0 and not operands.rotating:
@@ -88,8 +92,8 @@ def stiffness_product(operands, x, f):
         x: by coordinate, shape (3 n,).
         f: output, shape (3 n,).
     """
-    for i in range(f.shape[0]):
-        f[i] = 0.0
+    for s in range(operands.reach.shape[0]):
+        f[3 * operands.reach[s, 0] : 3 * operands.reach[s, 1]] = 0.0
     add_rows(operands.rows, operands.awake, x, f)
     if operands.domains.used.shape[0] > 0 and not operands.rotating:
         add_still_domains(operands.domains, operands.awake, x, f)
@@ -217,6 +221,7 @@ class ElasticModel:
         self._elements = CorotationalElements(mesh, *plain) if self.rotating else None
         self._domains = NodeDomains(mesh, lam, (1 - PLAIN_SHARE) * mu) if smoothed else None
         self._assembled = name == 'linear'
+        self._neighbours: Neighbours | None = None
         self._mass = np.zeros(0)
         self._diagonal = np.zeros(0)
         self._norms = np.zeros(0)
@@ -235,6 +240,8 @@ class ElasticModel:
         if self._elements is not None:
             stars = [self.mesh.star(int(node)) for node in touched.rest]
             self._elements.update(np.concatenate([touched.tetrahedra, *stars]))
+        if self._neighbours is not None:
+            self._neighbours.update(touched.nodes)
         self._gather(touched.nodes)
 
     def _gather(self, nodes: np.ndarray) -> None:
@@ -275,25 +282,49 @@ class ElasticModel:
         """
         return np.asarray(self._norms[nodes] / self._mass[nodes])
 
-    def operands(
-        self, awake: np.ndarray | None = None, chunks: np.ndarray | None = None
-    ) -> Operands:
+    @property
+    def neighbours(self) -> Neighbours:
+        """Which nodes share an element; made when first asked for."""
+        if self._neighbours is None:
+            self._neighbours = Neighbours(self.mesh)
+        return self._neighbours
+
+    def operands(self, nodes: np.ndarray | None = None) -> Operands:
         """What the kernels take.
 
         Args:
-            awake: intervals of nodes, None: all, shape (s, 2).
-            chunks: of elements, None: all, shape (k,).
+            nodes: at which the force is to be right, None: all; sorted, shape (a,).
         """
-        if awake is None:
-            awake = np.array([[0, self.mesh.node_count]])
-        if chunks is None:
-            chunks = np.arange(-(-len(self.mesh.tetrahedra) // LANES) if self._elements else 0)
+        if nodes is not None:
+            return self.operands_within(self.neighbours.levels(nodes, 2), 0)
+        whole = np.array([[0, self.mesh.node_count]])
+        chunks = np.arange(-(-len(self.mesh.tetrahedra) // LANES) if self._elements else 0)
+        return self._operands(whole, whole, chunks)
+
+    def operands_within(self, level: np.ndarray, most: int) -> Operands:
+        """What the kernels take for the force at the nodes up to a level.
+
+        Args:
+            level: `Neighbours.levels` of `most` + 2 rings at least, shape (n,).
+            most: of the nodes at which the force is to be right.
+        """
+        chunks = np.zeros(0, np.int64)
+        rows, reach = intervals(level, most + 1), intervals(level, most + 2)
+        if self._elements:
+            chunks = chunks_around(self.mesh, np.flatnonzero(level <= most), LANES)
+            theirs = (level > most + 2).astype(np.uint8)
+            theirs[nodes_of_chunks(self.mesh, chunks, LANES)] = 0
+            reach = intervals(theirs, 0)
+        return self._operands(rows, reach, chunks)
+
+    def _operands(self, rows: np.ndarray, reach: np.ndarray, chunks: np.ndarray) -> Operands:
         return Operands(
             self.tensor_mass.operands if self.tensor_mass else _NO_ROWS,
             self._domains.operands if self._domains else _NO_DOMAINS,
             self._elements.operands if self._elements else _NO_ELEMENTS,
             int(self.rotating),
-            awake,
+            rows,
+            reach,
             chunks,
         )
 
@@ -316,18 +347,20 @@ class ElasticModel:
         """Elastic force that resists a displacement [N], shape (n, 3), see `evaluate`."""
         return self.evaluate(u)[0]
 
-    def product(self, x: np.ndarray) -> np.ndarray:
+    def product(self, x: np.ndarray, nodes: np.ndarray | None = None) -> np.ndarray:
         """Stiffness, with rotations as they are, times some displacement.
 
         Args:
             x: [m], shape (n, 3).
+            nodes: at which it is wanted, None: all; sorted, shape (a,).
 
         Returns:
-            [N], shape (n, 3).
+            [N], shape (n, 3); with `nodes` at these only, shape (a, 3).
         """
         f = np.empty(3 * self.mesh.node_count)
-        stiffness_product(self.operands(), np.ascontiguousarray(x, float).ravel(), f)
-        return f.reshape(-1, 3)
+        stiffness_product(self.operands(nodes), np.ascontiguousarray(x, float).ravel(), f)
+        force = f.reshape(-1, 3)
+        return force if nodes is None else force[nodes]
 
     def dense(self) -> np.ndarray:
         """The stiffness matrix [N/m], shape (3 n, 3 n); for small meshes and tests."""

@@ -13,9 +13,22 @@ from tissue_sim.elasticity import internal_force
 
 
 @njit(cache=True, error_model='numpy')
+def _copy(intervals, source, target):
+    for s in range(intervals.shape[0]):
+        a, b = 3 * intervals[s, 0], 3 * intervals[s, 1]
+        target[a:b] = source[a:b]
+
+
+@njit(cache=True, error_model='numpy')
 def _ahead(q, u, v, beta):
     for i in range(q.shape[0]):
         q[i] = u[i] + beta * v[i]
+
+
+@njit(cache=True, error_model='numpy')
+def _move(u, v, dt):
+    for i in range(u.shape[0]):
+        u[i] += dt * v[i]
 
 
 @njit(cache=True, error_model='numpy')
@@ -64,7 +77,7 @@ def euler_steps(
     held = u if symplectic else q
     force, last = np.zeros(3), np.zeros((2, 3))
     done = start_of_work(spring, u, last)
-    q[:] = u
+    _copy(operands.reach, u, q)
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
@@ -79,10 +92,10 @@ def euler_steps(
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
             if not symplectic:
-                u[a:b] += dt * v[a:b]
+                _move(u[a:b], v[a:b], dt)
             _accelerate(v[a:b], f[a:b], inverse_mass[a:b], alpha, dt)
             if symplectic:
-                u[a:b] += dt * v[a:b]
+                _move(u[a:b], v[a:b], dt)
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
@@ -102,9 +115,7 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
     f, du, dv = work[3, :size], work[4, :size], work[5, :size]
     force, last = np.zeros(3), np.zeros((2, 3))
     done = start_of_work(spring, u, last)
-    us[:] = u
-    vs[:] = v
-    q[:] = u
+    _copy(operands.reach, u, q)
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]

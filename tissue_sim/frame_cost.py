@@ -2,13 +2,13 @@
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.candidate import Candidate, Cost, Task
-from tissue_sim.contact import ToolContact, press_triangle
+from tissue_sim.contact import Frame, ToolContact, press_triangle
 from tissue_sim.elasticity import ModelName
 from tissue_sim.integrators import IntegratorName
 from tissue_sim.press import Press, places
@@ -16,6 +16,8 @@ from tissue_sim.simulation import TissueSimulation
 
 _SHORT, _LONG = 4, 16
 _FRAMES = 16
+_REPEATS = 3
+"""Strokes of which each frame's least time counts: what else the machine does only adds to it."""
 _COUPLING = 200.0
 """Stiffness of the spring that costs are measured with [N/m]."""
 
@@ -28,20 +30,21 @@ def frame_cost(task: Task, model: ModelName, integrator: IntegratorName) -> Cost
     """
     presses = places(task.mesh, task.budget.contact_radius)
     if integrator == 'implicit':  # how many iterations it takes depends on where and how
-        found = [_frame_times(task, model, integrator, press, _LONG) for press in presses]
-        long, substeps, step = max(found)
-        return Cost(substeps, step, long, 0.0)
-    press = presses[0]
-    long, substeps, step = _frame_times(task, model, integrator, press, _LONG)
-    if substeps <= _LONG:
-        return (
-            Cost(substeps, step, long, 0.0)
-            if substeps == 1
-            else Cost(substeps, step, 0.0, long / substeps)
-        )
-    short, _, _ = _frame_times(task, model, integrator, press, _SHORT)
-    each = max((long - short) / (_LONG - _SHORT), long / _LONG / 4)
-    return Cost(substeps, step, max(long - _LONG * each, 0.0), each)
+        found = [_Timed(task, model, integrator, press, _LONG) for press in presses]
+        for timed in found:
+            timed.stroke(_REPEATS)
+        return Cost(found[0].substeps, found[0].step, max(timed.frame for timed in found), 0.0)
+    long, short = (_Timed(task, model, integrator, presses[0], most) for most in (_LONG, _SHORT))
+    for _ in range(_REPEATS):  # by turns, so that both meet the same machine
+        long.stroke()
+        if long.substeps > _LONG:
+            short.stroke()
+    if long.substeps == 1:
+        return Cost(1, long.step, long.frame, 0.0)
+    if long.substeps <= _LONG:
+        return Cost(long.substeps, long.step, 0.0, long.frame / long.substeps)
+    each = max((long.frame - short.frame) / (_LONG - _SHORT), long.frame / _LONG / 4)
+    return Cost(long.substeps, long.step, max(long.frame - _LONG * each, 0.0), each)
 
 
 def frame_time(integrator: IntegratorName, times: list[float]) -> float:
@@ -54,65 +57,90 @@ def frame_time(integrator: IntegratorName, times: list[float]) -> float:
     return float(np.percentile(times, 90 if integrator == 'implicit' else 50))
 
 
-def _frame_times(
-    task: Task, model: ModelName, integrator: IntegratorName, press: Press, most: int
-) -> tuple[float, int, float]:
-    """CPU time of a frame of at most so many substeps; how many are needed, and how long [s]."""
-    s = task.stepping
-    stepping = replace(
-        s, integrator=integrator, min_substeps=min(s.min_substeps, most), max_substeps=most
-    )
-    simulation = TissueSimulation(
-        task.mesh, task.material, task.resistance, model=model, stepping=stepping
-    )
-    times = []
-    for number in range(_FRAMES):
-        contact = _contact(task, press, math.sin(math.pi * number / _FRAMES) ** 2)
-        start = time.thread_time()
-        frame = simulation.frame(contact)
-        times.append(time.thread_time() - start)
-    needed = frame.substeps / max(frame.slow_motion, 1e-12)
-    return frame_time(integrator, times[1:]), math.ceil(needed - 1e-9), float(1 / s.rate / needed)
-
-
-def _contact(task: Task, press: Press, share: float) -> ToolContact:
-    # Less than what lets the blade in: contact stays contact.
-    depth = min(0.9 * task.resistance.threshold / _COUPLING, 0.5 * task.budget.displacement)
-    return press_triangle(task.mesh, press.centre, press.direction, share * depth, _COUPLING)
-
-
-@dataclass(frozen=True)
-class _Strokes:
-    """Frames in which a tool goes in, out, and stays away.
+class _Timed:
+    """A simulation whose frames have at most so many substeps, and how long they take.
 
     Attributes:
-        cost: of a frame in contact, the median [s].
-        displacement: after each frame [m], shape (f, n, 3).
+        substeps: that a frame needs, of `step` [s] each.
     """
 
-    cost: float
-    displacement: np.ndarray
+    def __init__(
+        self, task: Task, model: ModelName, integrator: IntegratorName, press: Press, most: int
+    ) -> None:
+        s = task.stepping
+        stepping = replace(
+            s, integrator=integrator, min_substeps=min(s.min_substeps, most), max_substeps=most
+        )
+        self._simulation = TissueSimulation(
+            task.mesh, task.material, task.resistance, model=model, stepping=stepping
+        )
+        self._contacts = _in_and_out(task, press)
+        self._times: list[list[float]] = []
+        self.substeps, self.step = 0, 0.0
+
+    def stroke(self, repeats: int = 1) -> None:
+        """A tool goes in and out."""
+        for _ in range(repeats):
+            times = []
+            for contact in self._contacts:
+                frame, spent = _timed(self._simulation, contact)
+                times.append(spent)
+            self._times.append(times[1:])
+        needed = frame.substeps / max(frame.slow_motion, 1e-12)
+        self.substeps = math.ceil(needed - 1e-9)
+        self.step = float(1 / self._simulation.dynamics.stepping.rate / needed)
+
+    @property
+    def frame(self) -> float:
+        """CPU time of a frame [s]."""
+        integrator = self._simulation.dynamics.stepping.integrator
+        return frame_time(integrator, np.min(self._times, axis=0).tolist())
 
 
-def _strokes(task: Task, candidate: Candidate, active: ActiveSettings) -> _Strokes:
-    simulation = TissueSimulation(
-        task.mesh,
-        task.material,
-        task.resistance,
-        model=candidate.model,
-        stepping=task.stepped_by(candidate),
-        active=active,
-    )
-    press = places(task.mesh, task.budget.contact_radius, 1)[0]
-    times, seen = [], []
-    for number in range(2 * _FRAMES):
-        inside = number < _FRAMES
-        share = math.sin(math.pi * number / _FRAMES) ** 2
-        start = time.thread_time()
-        simulation.frame(_contact(task, press, share) if inside else None)
-        times.append(time.thread_time() - start)
-        seen.append(simulation.displacement.copy())
-    return _Strokes(float(np.median(times[1:_FRAMES])), np.array(seen))
+def _in_and_out(task: Task, press: Press) -> list[ToolContact]:
+    # Less than what lets the blade in: contact stays contact.
+    depth = min(0.9 * task.resistance.threshold / _COUPLING, 0.5 * task.budget.displacement)
+    shares = [math.sin(math.pi * number / _FRAMES) ** 2 for number in range(_FRAMES)]
+    place = press.centre, press.direction
+    return [press_triangle(task.mesh, *place, share * depth, _COUPLING) for share in shares]
+
+
+def _timed(simulation: TissueSimulation, contact: ToolContact | None) -> tuple[Frame, float]:
+    """A frame, and its CPU time [s]."""
+    start = time.thread_time()
+    frame = simulation.frame(contact)
+    return frame, time.thread_time() - start
+
+
+class _Strokes:
+    """Frames in which a tool goes in, out, and stays away, with so much of the tissue moving."""
+
+    def __init__(self, task: Task, candidate: Candidate, active: ActiveSettings) -> None:
+        self._simulation = TissueSimulation(
+            task.mesh,
+            task.material,
+            task.resistance,
+            model=candidate.model,
+            stepping=task.stepped_by(candidate),
+            active=active,
+        )
+        press = places(task.mesh, task.budget.contact_radius, 1)[0]
+        self._contacts = _in_and_out(task, press)
+        self._times: list[list[float]] = []
+
+    def stroke(self) -> np.ndarray:
+        """The displacement after each frame [m], shape (f, n, 3)."""
+        times, seen = [], []
+        for contact in [*self._contacts, *[None] * _FRAMES]:
+            times.append(_timed(self._simulation, contact)[1])
+            seen.append(self._simulation.displacement.copy())
+        self._times.append(times[1:_FRAMES])
+        return np.array(seen)
+
+    @property
+    def frame(self) -> float:
+        """CPU time of a frame in contact [s]."""
+        return float(np.median(np.min(self._times, axis=0)))
 
 
 def with_regions(
@@ -128,14 +156,16 @@ def with_regions(
         candidate: with all nodes moving.
         regions: which nodes move.
     """
-    whole = _strokes(task, candidate, ActiveSettings())
-    most = float(np.linalg.norm(whole.displacement, axis=2).max())
+    whole, *parts = (_Strokes(task, candidate, r) for r in [ActiveSettings(), *regions])
+    right, *others = [strokes.stroke() for strokes in [whole, *parts]]
+    for _ in range(_REPEATS - 1):  # by turns, so that all meet the same machine
+        for strokes in [whole, *parts]:
+            strokes.stroke()
+    most = float(np.linalg.norm(right, axis=2).max())
     found = []
-    for region in regions:
-        part = _strokes(task, candidate, region)
-        apart = np.linalg.norm(part.displacement - whole.displacement, axis=2).max()
-        wrong, share = float(apart) / most, part.cost / whole.cost
-        cost = candidate.cost
+    for region, part, seen in zip(regions, parts, others, strict=True):
+        wrong = float(np.linalg.norm(seen - right, axis=2).max()) / most
+        share, cost = part.frame / whole.frame, candidate.cost
         found.append(
             replace(
                 candidate,

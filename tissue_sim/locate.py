@@ -116,6 +116,24 @@ def distance_to_triangles(point, positions, triangles):
 
 
 @njit(cache=True)
+def closest_triangle(point, positions, triangles):
+    """Number of the triangle that is closest to a point.
+
+    Args:
+        point: [m], shape (3,).
+        positions: [m], shape (n, 3).
+        triangles: shape (k, 3), one at least.
+    """
+    least, found = np.inf, 0
+    for i in range(len(triangles)):
+        a, b, c = triangles[i]
+        distance = _squared_distance(point, positions[a], positions[b], positions[c])
+        if distance < least:
+            least, found = distance, i
+    return found
+
+
+@njit(cache=True)
 def _squared_distance(p, a, b, c):
     """To a triangle, by the Voronoi region of plane, edges and corners (Ericson 2005, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a

@@ -298,6 +298,23 @@ class TetMesh:
         return np.array(star, np.int64)
 
 
+def carried_over(rows: np.ndarray, count: int, delta: TopologyDelta, touched: Touched) -> None:
+    """Carries values by node through a change of connectivity, in place.
+
+    Args:
+        rows: with room for the new nodes, shape (count + a or more, d).
+        count: of nodes before the change.
+        delta: the change.
+        touched: what `TetMesh.apply` said of it.
+    """
+    new = interpolated(rows, delta.node_parents, delta.node_weights)
+    moved = interpolated(rows, delta.moved_parents, delta.moved_weights)
+    rows[count : count + len(new)] = new
+    rows[np.asarray(delta.moved_nodes, np.int64)] = moved
+    for target, source in touched.renumbered:
+        rows[target] = rows[source]
+
+
 def interpolated(values: np.ndarray, parents: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Weighted sums of four rows each, added in the order of the parents.
 

@@ -146,7 +146,10 @@ def _check_arrays(nodes: Nodes, tetrahedra: Tetrahedra) -> None:
         raise MeshError(f'tetrahedra have the shape {tetrahedra.shape}: it must be (m, 4), m >= 1')
     bad = _first(~np.isfinite(nodes).all(axis=1))
     if bad is not None:
-        raise MeshError(f'node {bad} lies at {_place(nodes[bad])}: coordinates must be finite')
+        raise MeshError(
+            f'node {bad} lies at {_place(nodes[bad])}: coordinates must be finite, export the mesh '
+            'again'
+        )
     bad = _first(((tetrahedra < 0) | (tetrahedra >= len(nodes))).any(axis=1))
     if bad is not None:
         raise MeshError(

@@ -4,14 +4,14 @@ import array
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from cutting_trainer_msgs.msg import Contact, ForceSample, FrameInputs, Mesh, MeshDelta
 from cutting_trainer_msgs.srv import Cut
 
 from tissue_sim.contact import Frame
 from tissue_sim.mesh import TetMesh, TopologyDelta, Touched
-from tissue_sim.replica import state_hash
-from tissue_sim.ros import FRAME
+from tissue_sim.replica import MeshReplica, state_hash
+from tissue_sim.ros import FRAME, stamp
+from tissue_sim.stamps import REVISIONS
 
 _CODES = {'d': np.float64, 'I': np.uint32, 'B': np.uint8}
 
@@ -23,13 +23,13 @@ def packed(code: str, values: np.ndarray) -> 'array.array[Any]':
     return out
 
 
-def stamp(nanoseconds: int) -> Time:
-    """A time stamp [ns] as a message."""
-    return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
-
-
 def mesh_message(
-    mesh: TetMesh, displacement: np.ndarray, scene: str, revision: int, step: int, time_ns: int
+    mesh: TetMesh | MeshReplica,
+    displacement: np.ndarray,
+    scene: str,
+    revision: int,
+    step: int,
+    time_ns: int,
 ) -> Mesh:
     """The whole tissue as a message."""
     message = Mesh(scene=scene, revision=revision, topology=mesh.topology, step=step)
@@ -77,13 +77,14 @@ class DeltaEncoder:
         """
         n = self._mesh.node_count
         if touched is None:
-            displaced = np.flatnonzero((displacement != self._sent).any(axis=1))
+            differs = displacement != self._sent
+            displaced = np.flatnonzero(differs[:, 0] | differs[:, 1] | differs[:, 2])
             if len(displaced) == 0:
                 return None
         else:
             displaced = np.arange(n)
         message = MeshDelta(base_revision=self.revision, step=step, topology=self._mesh.topology)
-        self.revision += 1
+        self.revision = (self.revision + 1) % REVISIONS
         message.revision = self.revision
         message.header.frame_id = FRAME
         message.header.stamp = stamp(time_ns)

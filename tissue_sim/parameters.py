@@ -6,6 +6,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
+from tissue_sim.replica import MOST_NODES
+
 LARGEST_SEED = 2**63 - 1
 
 
@@ -33,6 +35,8 @@ def parameter(
     Raises:
         ValueError: it was given a value of another type, or out of its range.
     """
+    if node.has_parameter(name):  # of a node that is configured again
+        return node.get_parameter(name).value
     descriptor = ParameterDescriptor(
         description=description, additional_constraints=constraints, read_only=not settable
     )
@@ -52,6 +56,20 @@ def parameter(
         ) from None
 
 
+def announced(node: Node, name: str, value: Any, description: str) -> None:
+    """Declares a parameter that says what the node does; it cannot be given from outside.
+
+    Args:
+        node: that has it.
+        name: of it.
+        value: that it has.
+        description: what it means, with its unit.
+    """
+    if not node.has_parameter(name):  # else it is configured again, and says what it said
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        node.declare_parameter(name, value, descriptor, ignore_override=True)
+
+
 def scene_parameter(node: Node) -> str:
     """Path of the scene file, `scene`."""
     return str(
@@ -63,3 +81,15 @@ def seed_parameter(node: Node) -> int:
     """Seed of everything random in the node, `seed`."""
     text = 'seed of everything random [-]'
     return int(parameter(node, 'seed', 0, text, within=(0, LARGEST_SEED)))
+
+
+def max_nodes_parameter(node: Node) -> int:
+    """Largest mesh that the node accepts, `max_nodes`."""
+    text = 'nodes of a mesh that is accepted; of tetrahedra and triangles eight times as many [-]'
+    return int(parameter(node, 'max_nodes', MOST_NODES, text, within=(4, 2**28)))
+
+
+def max_message_parameter(node: Node, default: int) -> int:
+    """Largest message that the node accepts [bytes], `max_message`."""
+    text = 'largest message that is accepted, meshes aside: max_nodes bounds those [bytes]'
+    return int(parameter(node, 'max_message', default, text, within=(1024, 2**32)))

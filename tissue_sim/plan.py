@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.candidate import Candidate, Cost, Errors, Task
-from tissue_sim.dynamics import TimeStepping
 from tissue_sim.elasticity import MODELS, ModelName
 from tissue_sim.frame_cost import frame_cost, with_regions
 from tissue_sim.integrators import INTEGRATORS, IntegratorName
@@ -23,6 +22,8 @@ _CHEAP = 0.1
 """Share of what a frame may cost below which there is nothing to gain."""
 _PREFERENCE: tuple[IntegratorName, ...] = ('symplectic_euler', 'rk4', 'implicit', 'euler')
 """Second order and no damping of its own, fourth order, damping, no stability without damping."""
+_CHECKED = 0.4
+"""Depth of a dent over its radius up to which predictions hold against quadratic elements."""
 _FEWEST = 30
 """Nodes that an active region has at least."""
 _HOPELESS = 0.25
@@ -55,9 +56,15 @@ class Plan:
         return self.task.worst(self.chosen) if self.chosen else None
 
     @property
-    def stepping(self) -> TimeStepping:
-        """How frames are stepped through by what was chosen."""
-        return self.task.stepped_by(self.chosen) if self.chosen else self.task.stepping
+    def caution(self) -> str:
+        """A sentence where the dent is deeper than any that predictions were checked in."""
+        if self.chosen is None or self.probing.strains.steepness <= _CHECKED:
+            return ''
+        return (
+            f'the dent is {self.probing.strains.steepness:.2f} of its radius deep, and errors are '
+            f'checked up to {_CHECKED:g}: deeper, the tissue may yield by far more than predicted; '
+            'a broader contact_radius or less displacement makes it shallower'
+        )
 
     def over(self, substeps: float, tetrahedra: int) -> str:
         """A sentence if the tissue as it has been cut costs more than it may, else nothing.

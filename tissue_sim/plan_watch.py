@@ -33,6 +33,11 @@ class PlanWatch:
             f'have one: {"; or ".join(self._plan.remedies)}'
         )
 
+    @property
+    def warnings(self) -> list[str]:
+        """What to say loudly at start."""
+        return [sentence for sentence in (self.unmet, self._plan.caution) if sentence]
+
     def announcement(self) -> list[str]:
         """What is taken, with what was predicted of it, and what is not."""
         said = [f'not {rejection}' for rejection in self._plan.rejected]

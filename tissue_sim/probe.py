@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tissue_sim.dent import Dent, dents
+from tissue_sim.dent import Dents, dents
 from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.errors import MeshError
 from tissue_sim.material import Material
@@ -37,22 +37,27 @@ class Strains:
     @cached_property
     def linear(self) -> float:
         """Of models whose elements do not turn [-]; infinite where the tissue gives way before."""
-        return self._worst(rotating=False)
+        return self._error(rotating=False)
 
     @cached_property
     def rotating(self) -> float:
         """Of models whose elements turn [-]; infinite where they or the tissue give way."""
-        return self._worst(rotating=True)
+        return self._error(rotating=True)
 
-    def _worst(self, *, rotating: bool) -> float:
-        return max((dent.error(rotating) for dent in self._dents), default=float('inf'))
+    @property
+    def steepness(self) -> float:
+        """Depth of the dent over its radius [-]; infinite where the tissue gives way before."""
+        return self._dents.steepness if self._dents else float('inf')
+
+    def _error(self, *, rotating: bool) -> float:
+        return self._dents.error(rotating) if self._dents else float('inf')
 
     @cached_property
-    def _dents(self) -> list[Dent]:
+    def _dents(self) -> Dents | None:
         try:
             return dents(self.mesh, self.material, self.press, self.depth)
         except MeshError:
-            return []
+            return None
 
 
 @dataclass(frozen=True)

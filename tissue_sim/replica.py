@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from tissue_sim.mesh import grown
+from tissue_sim.errors import MeshError
+from tissue_sim.mesh import TetMesh, grown
+from tissue_sim.refusals import MessageError
+from tissue_sim.stamps import newer
 
 
 def state_hash(rest: np.ndarray, displacement: np.ndarray, tetrahedra: np.ndarray) -> int:
@@ -22,14 +25,28 @@ def state_hash(rest: np.ndarray, displacement: np.ndarray, tetrahedra: np.ndarra
     return int.from_bytes(digest.digest(), 'little')
 
 
+MOST_NODES = 2_000_000
+"""Nodes of a mesh that is accepted, unless a node's parameter `max_nodes` says else."""
+
+
+BYTES_A_NODE = 512
+"""Of the message of a mesh that has as many tetrahedra and triangles as are accepted."""
+FARTHEST = 1e3
+"""[m] from the origin of the tissue frame that a node may be."""
+
+
 class MeshReplica:
     """Arrays rebuilt from `Mesh` and `MeshDelta` messages, or anything with the same fields.
+
+    Args:
+        max_nodes: of a mesh that is accepted; of tetrahedra and triangles eight times as many.
 
     Attributes:
         revision, topology, step: of the last message; revision is -1 before the first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, max_nodes: int = MOST_NODES) -> None:
+        self._most = {'nodes': max_nodes, 'tetrahedra': 8 * max_nodes, 'triangles': 8 * max_nodes}
         self.revision = -1
         self.topology = -1
         self.step = 0
@@ -75,6 +92,20 @@ class MeshReplica:
         """Current positions [m], shape (n, 3); a new array."""
         return self.rest + self.displacement
 
+    def mesh(self) -> TetMesh:
+        """A mesh of its own with the same nodes, tetrahedra and surface.
+
+        Raises:
+            MeshError: what was received is no mesh.
+        """
+        mesh = TetMesh(self.rest, self.tetrahedra, self.fixed)
+        if len(mesh.triangles) != self._tris:
+            text = f'{self._tris} surface triangles were sent, the tetrahedra have'
+            raise MeshError(f'{text} {len(mesh.triangles)}')
+        mesh.topology = self.topology
+        mesh.set_kinds(self.triangles, self.triangle_kind)
+        return mesh
+
     def hash(self) -> int:
         """`state_hash` of what the replica holds."""
         return state_hash(self.rest, self.displacement, self.tetrahedra)
@@ -86,9 +117,10 @@ class MeshReplica:
             mesh: a `Mesh` message.
 
         Raises:
-            ValueError: its arrays do not fit each other.
+            MessageError: its arrays do not fit each other or the hash of it, or a number cannot be.
         """
         n, remainder = divmod(len(mesh.rest), 3)
+        self._require_size(n, len(mesh.tetrahedra) // 4, len(mesh.triangles) // 3)
         tets = _indices(mesh.tetrahedra, 4, n, 'tetrahedra')
         tris = _indices(mesh.triangles, 3, n, 'triangles')
         lengths = (
@@ -99,10 +131,14 @@ class MeshReplica:
         )
         for name, have, want in lengths:
             if have != want:
-                raise ValueError(f'mesh field {name} has a length that does not fit {n} nodes')
+                text = f'mesh field {name} has a length that does not fit {n} nodes'
+                raise MessageError('arrays that do not fit', text)
+        rest, moved = _positions(mesh.rest, 'rest'), _positions(mesh.displacement, 'displacement')
+        given = getattr(mesh, 'state_hash', 0)
+        if given and given != state_hash(rest, moved, tets):
+            raise MessageError('not what its hash says', f'mesh of revision {mesh.revision}')
         self._nodes, self._tets, self._tris = n, len(tets), len(tris)
-        self._rest = np.array(mesh.rest, float).reshape(-1, 3)
-        self._displacement = np.array(mesh.displacement, float).reshape(-1, 3)
+        self._rest, self._displacement = rest, moved
         self._fixed = np.array(mesh.fixed, np.uint8)
         self._tetrahedra, self._triangles = tets, tris
         self._kind = np.array(mesh.triangle_kind, np.uint8)
@@ -119,13 +155,15 @@ class MeshReplica:
             mesh is needed. A delta that this revision already contains is passed over with True.
 
         Raises:
-            ValueError: its arrays do not fit each other; nothing is changed.
+            MessageError: its arrays do not fit each other, or a number cannot be; nothing is
+                changed.
         """
-        if delta.revision <= self.revision:
+        if not newer(delta.revision, self.revision):
             return True
         if delta.base_revision != self.revision:
             return False
         n, m, k = delta.node_count, delta.tetrahedron_count, delta.triangle_count
+        self._require_size(n, m, k)
         everything = len(delta.displaced) == 0 and len(delta.displacement) > 0
         rest_at = _slots(delta.rest_changed, n, 'rest_changed')
         tets_at = _slots(delta.tetrahedra_changed, m, 'tetrahedra_changed')
@@ -144,16 +182,24 @@ class MeshReplica:
         )
         for name, have, want in lengths:
             if have != want:
-                raise ValueError(f'mesh delta field {name} has {have} values where {want} belong')
+                text = f'mesh delta field {name} has {have} values where {want} belong'
+                raise MessageError('arrays that do not fit', text)
+        rest, moved = _positions(delta.rest, 'rest'), _positions(delta.displacement, 'displacement')
         self._resize(n, m, k)
-        self._rest[rest_at] = np.array(delta.rest, float).reshape(-1, 3)
+        self._rest[rest_at] = rest
         self._fixed[rest_at] = np.array(delta.fixed, np.uint8)
         self._tetrahedra[tets_at] = tets
         self._triangles[tris_at] = tris
         self._kind[tris_at] = np.array(delta.triangle_kind, np.uint8)
-        self._displacement[moved_at] = np.array(delta.displacement, float).reshape(-1, 3)
+        self._displacement[moved_at] = moved
         self.revision, self.topology, self.step = delta.revision, delta.topology, delta.step
         return True
+
+    def _require_size(self, *counts: int) -> None:
+        for (name, most), count in zip(self._most.items(), counts, strict=True):
+            if count > most:
+                text = f'mesh of {count} {name}: this node accepts {most} (parameter max_nodes)'
+                raise MessageError('too large', text)
 
     def _require_growth(
         self, n: int, nodes: np.ndarray, m: int, tets: np.ndarray, k: int, triangles: np.ndarray
@@ -165,10 +211,11 @@ class MeshReplica:
             ('triangle', k, self._tris, triangles),
         ):
             if count > known + len(given):
-                raise ValueError(
+                text = (
                     f'mesh delta field {name}_count is {count}, but there are {known} and the '
                     f'delta gives {len(given)} slots'
                 )
+                raise MessageError('counts beyond its arrays', text)
 
     def _resize(self, n: int, m: int, k: int) -> None:
         self._rest = grown(self._rest, n)
@@ -180,17 +227,29 @@ class MeshReplica:
         self._nodes, self._tets, self._tris = n, m, k
 
 
+def _positions(values: Any, name: str) -> np.ndarray:
+    out: np.ndarray = np.array(values, float).reshape(-1, 3)
+    if not (np.abs(out) <= FARTHEST).all():  # a NaN is not
+        text = f'mesh field {name} has a number that is not finite or beyond {FARTHEST:g} m'
+        raise MessageError('not finite or too far', text)
+    return out
+
+
 def _slots(values: Any, limit: int, name: str) -> np.ndarray:
     slots = np.array(values, np.int64)
     if len(slots) and slots.max() >= limit:
-        raise ValueError(f'mesh delta field {name} has slot {slots.max()} of {limit}')
+        text = f'mesh delta field {name} has slot {slots.max()} of {limit}'
+        raise MessageError('index out of range', text)
     return slots
 
 
 def _indices(values: Any, width: int, nodes: int, name: str) -> np.ndarray:
     flat = np.array(values, np.int64)
     if len(flat) % width:
-        raise ValueError(f'mesh field {name} has {len(flat)} values, not a multiple of {width}')
+        text = f'mesh field {name} has {len(flat)} values, not a multiple of {width}'
+        raise MessageError('arrays that do not fit', text)
     if len(flat) and flat.max() >= nodes:
-        raise ValueError(f'mesh field {name} has node {flat.max()} of {nodes}')
+        raise MessageError(
+            'index out of range', f'mesh field {name} has node {flat.max()} of {nodes}'
+        )
     return flat.astype(np.int32).reshape(-1, width)

@@ -1,21 +1,23 @@
-"""What every node shell shares: names, QoS, polled subscriptions, diagnostics, a clean end."""
+"""What every node shell shares: names, QoS, polled subscriptions, diagnostics."""
 
-import signal
-import sys
-import threading
+import math
 import time
 from collections.abc import Callable
 from typing import Any
 
-import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy._rclpy_pybind11 import RMWError
 from rclpy.callback_groups import CallbackGroup
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
 
-FRAME = 'tissue'
+from tissue_sim.refusals import TISSUE_FRAME, MessageError
+from tissue_sim.stamps import seconds_and_nanoseconds
+
+FRAME = TISSUE_FRAME
 
 MESH = 'tissue/mesh'
 MESH_UPDATES = 'tissue/mesh_updates'
@@ -24,6 +26,8 @@ FORCE = 'tissue/force'
 FRAME_INPUTS = 'tissue/frame_inputs'
 CONTACT = 'tool/contact'
 CUT = 'cutting/cut'
+MESH_KEEPERS = ('cutting/get_mesh', 'haptic_bridge/get_mesh', 'viewer/get_mesh')
+"""Services that know the tissue when the one that owns it has died."""
 ARM = 'arm'
 HAND = f'{ARM}/hand/servo_cp'
 DIAGNOSTICS = '/diagnostics'
@@ -48,8 +52,23 @@ NEWEST_BEST_EFFORT = QoSProfile(
 )
 """Subscribers that use only the newest sample: a late one is worth less than the next."""
 LATCHED = _reliable(1, latched=True)
-UPDATES = _reliable(30)
+UPDATES = _reliable(150)
+"""Five seconds of deltas: a link may be away for so long before those behind it miss some."""
 EVENTS = _reliable(10)
+
+
+HISTORY = _reliable(1000, latched=True)
+"""Of what is said seldom and must be known to who comes later, all of it."""
+
+
+LATE = 1.5
+"""[s] without a word on /diagnostics after which a loop speaks itself."""
+
+
+def stamp(nanoseconds: int) -> Time:
+    """A time since the epoch [ns] as a message."""
+    seconds, rest = seconds_and_nanoseconds(nanoseconds)
+    return Time(sec=seconds, nanosec=rest)
 
 
 class PolledGroup(CallbackGroup):
@@ -72,10 +91,64 @@ def polled(node: Node, message_type: Any, topic: str, qos: QoSProfile) -> Any:
     )
 
 
-def take(subscription: Any) -> Any | None:
-    """The next message of a polled subscription, or None."""
-    taken = subscription.handle.take_message(subscription.msg_type, False)
-    return None if taken is None else taken[0]
+def read(data: bytes, message_type: Any, most: float = math.inf) -> Any:
+    """A message from CDR bytes as they came.
+
+    Args:
+        data: the bytes.
+        message_type: what they are taken for.
+        most: bytes of a message that is accepted.
+
+    Raises:
+        MessageError: they are too many, or no such message.
+    """
+    if len(data) > most:
+        raise MessageError('too large', f'{len(data)} bytes: this node accepts {most:.0f}')
+    try:
+        return deserialize_message(data, message_type)
+    except (RMWError, ValueError) as error:  # a string that is not UTF-8 is a ValueError
+        said = str(error).partition(', at ')[0]
+        raise MessageError('no such message', f'{len(data)} bytes: {said}') from None
+
+
+def take(subscription: Any, most: float = math.inf) -> Any | None:
+    """The next message of a polled subscription, or None.
+
+    By way of its bytes: a message that cannot be read would look as if there were none.
+
+    Raises:
+        MessageError: see `read`.
+    """
+    data = take_raw(subscription)
+    return None if data is None else read(data, subscription.msg_type, most)
+
+
+def listen(
+    node: Any,
+    message_type: Any,
+    topic: str,
+    hear: Callable[[Any], None],
+    qos: QoSProfile,
+    *,
+    most: float = 0.0,
+    **options: Any,
+) -> Any:
+    """Subscribes with a callback that may raise `MessageError`; the node's `refusals` count it.
+
+    Args:
+        node: a managed node.
+        message_type, topic, qos, options: as for `create_subscription`.
+        hear: takes a message.
+        most: bytes of a message that is accepted; 0: as the node's `max_message` says.
+    """
+
+    def hear_raw(data: bytes) -> None:
+        try:
+            hear(read(data, message_type, most or node.max_message))
+        except Exception as error:  # whatever a message does, the node goes on
+            node.refusals.add(topic, error)
+
+    return node.create_subscription(message_type, topic, hear_raw, qos, raw=True, **options)
 
 
 def take_raw(subscription: Any) -> bytes | None:
@@ -99,11 +172,13 @@ def introspect(node: Node, service: Any, *, contents: bool = True) -> None:
         contents: with requests and responses; without, only that and when there was a call.
     """
     what = ServiceIntrospectionState.CONTENTS if contents else ServiceIntrospectionState.METADATA
-    service.configure_introspection(node.get_clock(), EVENTS, what)
+    service.configure_introspection(node.get_clock(), STREAM, what)
 
 
 class Diagnostics:
     """Publishes one status of this node on /diagnostics, once a second.
+
+    It is called as the node is, with the namespace: `haptic_bridge`, or `left/haptic_bridge`.
 
     Args:
         node: the node to speak for.
@@ -117,94 +192,36 @@ class Diagnostics:
         self._node = node
         self._collect = collect
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, EVENTS)
+        self._spoke = time.monotonic()
         self._timer = node.create_timer(1.0, self.publish)
+
+    def catch_up(self) -> None:
+        """Publishes if the executor is late with it; for a loop that computes much.
+
+        The executor's thread waits for the interpreter again and again on the way to a callback,
+        each time for all that the loop computes without giving it up: long frames, ten times.
+        """
+        if time.monotonic() - self._spoke > LATE:
+            self.publish()
 
     def publish(self) -> None:
         """Publishes now; the last one before the end of a node is called by hand."""
+        self._spoke = time.monotonic()
         level, message, values = self._collect()
-        status = DiagnosticStatus(level=level, name=self._node.get_name(), message=message)
+        refusals = getattr(self._node, 'refusals', None)
+        if refusals is not None:
+            values |= refusals.values()
+            if news := refusals.news():
+                self._node.get_logger().warning(news)
+        if not getattr(self._node, 'is_active', True):
+            level, message = DiagnosticStatus.WARN, 'inactive'
+        name = self._node.get_fully_qualified_name().lstrip('/')
+        status = DiagnosticStatus(level=level, name=name, message=message)
         status.values = [KeyValue(key=k, value=_text(v)) for k, v in values.items()]
         array = DiagnosticArray(status=[status])
-        array.header.stamp = self._node.get_clock().now().to_msg()
+        array.header.stamp = stamp(time.time_ns())
         self._publisher.publish(array)
 
 
 def _text(value: object) -> str:
     return f'{value:.9g}' if isinstance(value, float) else str(value)
-
-
-class Stop:
-    """A flag that a signal handler may set at any moment; `threading.Event` can deadlock there."""
-
-    def __init__(self) -> None:
-        self._set = False
-
-    def set(self) -> None:
-        """Asks for the end."""
-        self._set = True
-
-    def is_set(self) -> bool:
-        """Whether the end is asked for."""
-        return self._set
-
-    def wait(self) -> None:
-        """Returns soon after `set`."""
-        while not self._set:
-            time.sleep(0.05)
-
-
-def announce_ready(node: Node) -> None:
-    """Tells the launcher, by a line on standard output, that the node does its work."""
-    print(f'ready: {node.get_name()}', flush=True)
-
-
-def run(make_node: Callable[[], Node], work: Callable[[Any, Stop], None] | None = None) -> Any:
-    """Runs a node to SIGINT or SIGTERM and ends it in order; the main of every node.
-
-    Callbacks are served by an executor. Where `work` is given, the executor has a thread of its own
-    and `work(node, stop)` has the main thread; it returns soon after `stop` is set. A node may have
-    a method `close()`, called before it is destroyed. A ValueError while the node is made ends the
-    process with that one sentence and exit status 2.
-
-    Returns:
-        The node, destroyed.
-    """
-    rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
-    stop = Stop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    try:
-        node = make_node()
-    except ValueError as error:
-        print(f'error: {error}', file=sys.stderr, flush=True)
-        rclpy.shutdown()
-        raise SystemExit(2) from None
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    spinner = threading.Thread(target=_spin, args=(executor, node, stop), daemon=True)
-    spinner.start()
-    try:
-        if work is None:
-            stop.wait()
-        else:
-            work(node, stop)
-    finally:
-        stop.set()
-        spinner.join(2.0)
-        if hasattr(node, 'close'):
-            node.close()
-        node.destroy_node()
-        rclpy.shutdown()
-    return node
-
-
-def _spin(executor: SingleThreadedExecutor, node: Node, stop: Stop) -> None:
-    while not stop.is_set():
-        try:
-            executor.spin_once(timeout_sec=0.1)
-        except ExternalShutdownException:
-            return
-        except Exception as error:
-            # Bytes of another type than the topic's, say: no reason to be deaf from then on.
-            said = f'a callback failed: {type(error).__name__}: {error}'
-            node.get_logger().error(said, throttle_duration_sec=1.0)

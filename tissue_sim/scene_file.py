@@ -110,7 +110,7 @@ def _compose(path: Path) -> MappingNode:
     except OSError as error:
         raise SceneError(f'{path} cannot be read: {error.strerror}') from None
     except YAMLError as error:
-        raise SceneError(_syntax_error(path, error)) from None
+        raise SceneError(syntax_error(path, error)) from None
     expected = f'a scene is a mapping of the sections {", ".join(SECTIONS)}'
     if root is None:
         raise SceneError(f'{path} is empty: {expected}')
@@ -119,7 +119,8 @@ def _compose(path: Path) -> MappingNode:
     return root
 
 
-def _syntax_error(path: Path, error: YAMLError) -> str:
+def syntax_error(path: Path, error: YAMLError) -> str:
+    """Says where a file is no YAML, and what to look for there."""
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         reason = ' '.join(str(part) for part in (error.context, error.problem) if part)

@@ -248,6 +248,12 @@ class TissueSettings(SceneModel):
         return self
 
     @property
+    def method_taken(self) -> dict[str, str | int | float]:
+        """What the tissue is computed by, by dotted key below `tissue`."""
+        region = {f'active_region.{k}': v for k, v in self.active_region.model_dump().items()}
+        return {'model': self.model, 'integrator': self.integrator, **region}
+
+    @property
     def unit_scale(self) -> float:
         """Metres by unit of the mesh file."""
         return UNIT_SCALE[self.unit]

@@ -6,9 +6,9 @@ import numpy as np
 
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Blade, Resistance, Sweep
-from tissue_sim.compliance import PointCompliance
 from tissue_sim.contact import Command, Frame, State, ToolContact
-from tissue_sim.coupling import FREE, HOLD, PUSH, Coupling
+from tissue_sim.contact_stiffness import ContactStiffness, spring_of
+from tissue_sim.coupling import FREE, PUSH, Coupling
 from tissue_sim.dynamics import Dynamics, Motion, TimeStepping
 from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.guard import TOOL_SPEED
@@ -55,10 +55,11 @@ class TissueSimulation:
         self.elements_cut = 0
         self._resistance = resistance
         self._frame_time = 1.0 / self.dynamics.stepping.rate
-        self._compliance = PointCompliance()
+        self._stiffness = ContactStiffness(self.dynamics)
         self._blade: Blade | None = None
         self._target: np.ndarray | None = None
         self._device: np.ndarray | None = None
+        self._moved = np.zeros(3)
         self._outstanding: Command | None = None
         self._finish_due = False
         if any(stretch):
@@ -83,6 +84,16 @@ class TissueSimulation:
     def positions(self) -> np.ndarray:
         """Current node positions [m], shape (n, 3); a new array."""
         return self.dynamics.positions
+
+    def resume(self, displacement: np.ndarray, step: int) -> None:
+        """Goes on from a shape and a frame, at rest, with no tool in it.
+
+        Args:
+            displacement: [m], shape (n, 3).
+            step: frame that the shape is of.
+        """
+        self.dynamics.resume(displacement)
+        self.step = step
 
     def frame(self, contact: ToolContact | None) -> Frame:
         """Simulates one frame.
@@ -115,11 +126,13 @@ class TissueSimulation:
             self._let_go()
             return replace(frame, state=self.state, command=self._next_finish())
         command, sweep = self._decide(contact, coupling)
+        force = self._reaction(coupling, motion)
+        outside = contact if self._blade is None else None
         return replace(
             frame,
             state=self.state,
-            force=self._reaction(coupling, motion),
-            stiffness=self._stiffness(coupling, contact),
+            force=force,
+            stiffness=self._stiffness.matrix(coupling, outside, self._moved, force),
             resistance=self._blade.limit if self._blade else 0.0,
             command=command,
             sweep=sweep,
@@ -129,9 +142,11 @@ class TissueSimulation:
         """Why the tool is not believed; empty: it is."""
         before = self._device
         self._device = None if contact is None else contact.device.copy()
+        self._moved = np.zeros(3)
         if before is None or contact is None:
             return ''
-        speed = float(np.linalg.norm(contact.device - before)) / self._frame_time
+        self._moved = contact.device - before
+        speed = float(np.linalg.norm(self._moved)) / self._frame_time
         if speed <= TOOL_SPEED:
             return ''
         return (
@@ -163,7 +178,7 @@ class TissueSimulation:
         Along the surface it starts relaxed: the tissue sticks to the tool within a frame and slips
         between frames.
         """
-        coupling, n = _spring_of(contact), contact.normal
+        coupling, n = spring_of(contact), contact.normal
         point = coupling.point(positions)
         start = point if self._target is None else self._target
         coupling.start = point + n * float((start - point) @ n)
@@ -230,34 +245,9 @@ class TissueSimulation:
             return np.zeros(3)
         internal = motion.elastic_force[coupling.nodes]
         if self.material.beta:
-            viscous = self.model.product(self.velocity)
-            internal = internal + self.material.beta * viscous[coupling.nodes]
+            viscous = self.model.product(self.velocity, coupling.nodes)
+            internal = internal + self.material.beta * viscous
         return np.asarray(-internal.sum(axis=0))
-
-    def _stiffness(self, coupling: Coupling, contact: ToolContact | None) -> np.ndarray:
-        """Of tissue and coupling spring in series [N/m], shape (3, 3).
-
-        A tool that touches nothing is told what it would meet: the first touch is then felt as
-        stiff as the rest, however late the answer to it comes.
-        """
-        spring = coupling
-        if spring.mode == FREE:
-            if contact is None or not self._foreseen(contact):
-                return np.zeros((3, 3))
-            spring = _spring_of(contact)
-        axes = np.eye(3) if spring.mode == HOLD else spring.normal[None]
-        free = self.dynamics.inverse_mass > 0
-        soft = self._compliance.estimate(self.model, free, spring.nodes, spring.weights, axes)
-        return axes.T @ np.linalg.inv(np.eye(len(axes)) / spring.stiffness + soft) @ axes
-
-    def _foreseen(self, contact: ToolContact) -> bool:
-        return (
-            self._blade is None
-            and contact.state == State.NONE
-            and contact.topology == self.mesh.topology
-            and len(contact.nodes) > 0
-            and contact.stiffness > 0
-        )
 
     def apply_cut(self, delta: TopologyDelta) -> Touched:
         """Carries a change of connectivity out; displacement and velocity are interpolated.
@@ -287,15 +277,3 @@ class TissueSimulation:
             self._finish_due = True
         elif failed == Command.ADVANCE and self._blade is not None:
             self._blade.unswept()
-
-
-def _spring_of(contact: ToolContact) -> Coupling:
-    """The spring that pushes where the tool touches, or would; its start is still open."""
-    return Coupling(
-        mode=PUSH,
-        nodes=contact.nodes,
-        weights=contact.weights,
-        end=contact.device - contact.offset,
-        normal=contact.normal,
-        stiffness=contact.stiffness,
-    )

@@ -8,28 +8,34 @@ from numba import njit
 from tissue_sim.elasticity import ElasticModel, stiffness_product
 from tissue_sim.integrators import IntegratorName
 from tissue_sim.mesh import grown
+from tissue_sim.rings import PATCH, spans_of, without
 
 
 @njit(cache=True, error_model='numpy')
-def _power_iterations(operands, inverse_mass, x, f, steps):
-    """Power iterations of M^-1 K on x in place; returns the last Rayleigh quotient (mass norm)."""
+def _power_iterations(operands, spans, inverse_mass, x, f, steps):
+    """Power iterations of M^-1 K on x in place; returns the last Rayleigh quotient (mass norm).
+
+    Nodes outside of `spans` are held; x is 0 there.
+    """
     quotient = 0.0
     for _ in range(steps):
         stiffness_product(operands, x, f)
         above = 0.0
         below = 0.0
         norm = 0.0
-        for i in range(x.shape[0]):
-            if inverse_mass[i] > 0.0:
-                above += x[i] * f[i]
-                below += x[i] * x[i] / inverse_mass[i]
-            f[i] *= inverse_mass[i]
-            norm = max(norm, abs(f[i]))
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                if inverse_mass[i] > 0.0:
+                    above += x[i] * f[i]
+                    below += x[i] * x[i] / inverse_mass[i]
+                f[i] *= inverse_mass[i]
+                norm = max(norm, abs(f[i]))
         if below == 0.0 or norm == 0.0:
             return 0.0
         quotient = above / below
-        for i in range(x.shape[0]):
-            x[i] = f[i] / norm
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                x[i] = f[i] / norm
     return quotient
 
 
@@ -38,7 +44,9 @@ class FrequencyBound:
 
     Right after a cut the bound is that of Gershgorin on the touched rows, or the old bound,
     whichever is higher: rigorous, local, some 40 % high. Power iterations spread over the next
-    frames then bring it down to 3 % above the frequency that they converge to.
+    frames then bring it down to 3 % above the frequency that they converge to. In a large tissue
+    they look at the PATCH nodes around the cut, the others held: held nodes only lower frequencies
+    that are not there, and the bound of before still counts.
 
     A cut makes small elements, and one sliver would dictate the step of the whole tissue. So nodes
     whose row exceeds a ceiling are integrated with as much mass as brings them down to it
@@ -62,6 +70,9 @@ class FrequencyBound:
         self._x = np.zeros(0)
         self._settled = 0.0
         self._provisional = 0.0
+        self._patch = np.zeros(0, np.int64)
+        self._cut: list[np.ndarray] = []
+        self._f = np.zeros(0)
         self.update(np.arange(model.mesh.node_count), inverse_mass)
         self.refine(self._ENOUGH)
         self._ceiling = growth * self._settled
@@ -82,9 +93,21 @@ class FrequencyBound:
         self._provisional = max(self._provisional, min(float(worst), self._ceiling))
         self._done = 0
         # What the cut touched may hold the new highest mode: start with a share of it.
-        self._x = grown(self._x, 3 * mesh.node_count)
-        rows = self._x[: 3 * mesh.node_count].reshape(-1, 3)
+        n = mesh.node_count
+        self._x = grown(self._x, 3 * n)
+        rows = self._x[: 3 * n].reshape(-1, 3)
         rows[touched] += 0.1 * np.random.default_rng(0).standard_normal((len(touched), 3))
+        self._cut.append(touched)
+
+    def _look_around(self) -> None:
+        """Chooses the nodes that the iterations are about: of cuts that they have not settled."""
+        n = self._model.mesh.node_count
+        before = self._patch[self._patch < n]
+        self._patch = np.arange(n)
+        if n > PATCH:
+            cut = np.concatenate(self._cut)
+            self._patch = self._model.neighbours.around(cut[cut < n], 2, PATCH)
+        self._x[: 3 * n].reshape(-1, 3)[without(before, self._patch)] = 0.0
 
     def inertia(self, nodes: np.ndarray) -> np.ndarray:
         """Masses to integrate some nodes with [kg], shape (r,), for nodes, shape (r,)."""
@@ -98,14 +121,26 @@ class FrequencyBound:
         """
         if self._done >= self._ENOUGH:
             return
-        x = self._x[: 3 * self._model.mesh.node_count]
+        if self._done == 0:
+            self._look_around()
+        n = self._model.mesh.node_count
+        some = len(self._patch) < n
+        if len(self._f) != 3 * n:
+            self._f = np.zeros(3 * n)
         square = _power_iterations(
-            self._model.operands(), self._inverse_mass, x, np.empty_like(x), steps
+            self._model.operands(self._patch if some else None),
+            spans_of(self._patch),
+            self._inverse_mass,
+            self._x[: 3 * n],
+            self._f,
+            steps,
         )
         self._done += steps
         if self._done >= self._ENOUGH:
-            self._settled = self.MARGIN * float(np.sqrt(max(square, 0.0)))
+            found = self.MARGIN * float(np.sqrt(max(square, 0.0)))
+            self._settled = max(found, self._settled) if some else found
             self._provisional = 0.0
+            self._cut = []
 
     @property
     def omega(self) -> float:

@@ -1,8 +1,8 @@
 """The tensor-mass method: node and edge tensors gathered from the stars of the nodes.
 
 Cotin 2000; thesis 4.3. The stiffness is kept as the symmetric 3x3 tensor of each node and the
-tensor of each edge (i, j), i < j, in the row of i; the transpose serves row j. Rows have slack, so
-that a cut changes the rows it touches and no other.
+tensor of each edge (i, j), i < j, in the row of i; the transpose serves row j. Rows lie packed, as
+what lies between them is loaded with them; one that a cut makes longer moves behind the last.
 """
 
 from typing import NamedTuple
@@ -11,8 +11,6 @@ import numpy as np
 from numba import njit
 
 from tissue_sim.mesh import TetMesh, grown
-
-_SLACK = 4
 
 
 class Tensors(NamedTuple):
@@ -75,15 +73,49 @@ def shape_gradients(rest, tetrahedra, tet, gradients):
 
 
 @njit(cache=True)
-def _edge_slot(tensors, node, column):
+def longer(room):
+    """Slots of a row that has outgrown its own."""
+    return room + room // 2 + 8
+
+
+@njit(cache=True)
+def move_row(start, used, room, columns, values, filled, node):
+    """Moves a row behind the last one, where it is given more room.
+
+    Args:
+        start, used, room: see `Tensors`.
+        columns: of all rows, shape (c,).
+        values: as many for each column, shape (w c,).
+        filled: slots that are given to rows, shape (1,).
+        node: which row.
+
+    Returns:
+        False: the arrays are too short.
+    """
+    width = values.shape[0] // columns.shape[0]
+    size, at, first = longer(room[node]), filled[0], start[node]
+    if at + size > columns.shape[0]:
+        return False
+    for k in range(used[node]):
+        columns[at + k] = columns[first + k]
+        for i in range(width):
+            values[width * (at + k) + i] = values[width * (first + k) + i]
+    start[node], room[node], filled[0] = at, size, at + size
+    return True
+
+
+@njit(cache=True)
+def _edge_slot(tensors, filled, node, column):
     """The slot of an edge in the row of `node`, made if there is room; -1 if there is none."""
     first = tensors.start[node]
     for slot in range(first, first + tensors.used[node]):
         if tensors.columns[slot] == column:
             return slot
     if tensors.used[node] == tensors.room[node]:
-        return -1
-    slot = first + tensors.used[node]
+        t = tensors
+        if not move_row(t.start, t.used, t.room, t.columns, t.blocks, filled, node):
+            return -1
+    slot = tensors.start[node] + tensors.used[node]
     tensors.used[node] += 1
     tensors.columns[slot] = column
     for i in range(9):
@@ -92,7 +124,7 @@ def _edge_slot(tensors, node, column):
 
 
 @njit(cache=True)
-def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu):
+def gather_rows(tensors, filled, links, rest, nodes, lame_lambda, lame_mu):
     """Computes the rows of some nodes from their stars.
 
     Thesis eq. 4.7, transposed as it must be:
@@ -101,13 +133,14 @@ def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu):
 
     Args:
         tensors: written for `nodes` only.
+        filled: slots that are given to rows; grows with rows that move, shape (1,).
         links: connectivity.
         rest: rest positions [m], shape (n, 3).
         nodes: which rows, shape (r,).
         lame_lambda, lame_mu: [Pa].
 
     Returns:
-        Index into `nodes` of the first whose row has no room, or -1.
+        Index into `nodes` of the first for whose row the arrays are too short, or -1.
     """
     g = np.empty((4, 3))
     for which in range(len(nodes)):
@@ -130,7 +163,7 @@ def gather_rows(tensors, links, rest, nodes, lame_lambda, lame_mu):
             for b in range(4):
                 other = links.tetrahedra[tet, b]
                 if other > node:
-                    slot = _edge_slot(tensors, node, 3 * other)
+                    slot = _edge_slot(tensors, filled, node, 3 * other)
                     if slot < 0:
                         return which
                     dot = g[a, 0] * g[b, 0] + g[a, 1] * g[b, 1] + g[a, 2] * g[b, 2]
@@ -214,8 +247,7 @@ class TensorMass:
         tets = np.sort(self._mesh.tetrahedra, axis=1).astype(np.int64)
         pairs = np.concatenate([tets[:, [i, j]] for i in range(4) for j in range(i + 1, 4)])
         edges = np.unique(pairs[:, 0] * n + pairs[:, 1])
-        np.add.at(room, edges // n, 1)
-        room += _SLACK
+        room += np.bincount(edges // n, minlength=n)
         start = np.concatenate([[0], np.cumsum(room)[:-1]])
         slots = int(room.sum())
         # Spare room, which costs nothing until it is used: no cut has to move it all.
@@ -228,7 +260,7 @@ class TensorMass:
             np.zeros(most, np.uint32),
             np.zeros(9 * most),
         )
-        self._used = slots
+        self._filled = np.array([slots])
         self._gather(np.arange(n))
 
     def update(self, nodes: np.ndarray) -> None:
@@ -249,28 +281,22 @@ class TensorMass:
         if len(self.tensors.room) > known:
             self.tensors.room[known:] = 0
         self._gather(np.asarray(nodes, np.int64))
-        if self._used > 4 * int(self.tensors.used[:n].sum()) + 4096:
+        if self._filled[0] > 4 * int(self.tensors.used[:n].sum()) + 4096:
             self.rebuild()
 
     def _gather(self, nodes: np.ndarray) -> None:
         mesh, remaining = self._mesh, nodes
         while len(remaining):
-            full = gather_rows(self.tensors, mesh.links, mesh.rest, remaining, *self._lame)
+            full = gather_rows(
+                self.tensors, self._filled, mesh.links, mesh.rest, remaining, *self._lame
+            )
             if full < 0:
                 return
-            self._give_room(int(remaining[full]))
             remaining = remaining[full:]
-
-    def _give_room(self, node: int) -> None:
-        room = 2 * int(self.tensors.room[node]) + 16
-        t = self.tensors
-        self.tensors = t._replace(
-            columns=grown(t.columns, self._used + room),
-            blocks=grown(t.blocks, 9 * (self._used + room)),
-        )
-        self.tensors.start[node] = self._used
-        self.tensors.room[node] = room
-        self._used += room
+            t = self.tensors
+            size = int(self._filled[0]) + longer(int(t.room[remaining[0]]))
+            columns = grown(t.columns, size)
+            self.tensors = t._replace(columns=columns, blocks=grown(t.blocks, 9 * len(columns)))
 
     @property
     def operands(self) -> Rows:

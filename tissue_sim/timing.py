@@ -1,6 +1,7 @@
 """Absolute deadlines for periodic loops, and what became of them."""
 
 import os
+import threading
 import time
 
 import numpy as np
@@ -88,6 +89,24 @@ class PeriodicLoop:
             **_quantiles('lateness', lateness, (50, 99, 99.9)),
             **_quantiles('busy', busy, (50, 99)),
         }
+
+
+class Turns:
+    """A lock that no thread gets again before another that waits for it has had it.
+
+    A loop that is behind its deadlines holds its lock nearly always; of `threading.Lock` it would
+    take it again before a thread that waits has woken, for seconds.
+    """
+
+    def __init__(self) -> None:
+        self._next, self._lock = threading.Lock(), threading.Lock()
+
+    def __enter__(self) -> None:
+        with self._next:  # who waits for the lock holds this: others queue behind
+            self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
 
 
 class Durations:

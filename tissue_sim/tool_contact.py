@@ -5,35 +5,52 @@ from typing import Any
 import numpy as np
 
 from tissue_sim.contact import State, ToolContact
+from tissue_sim.refusals import MessageError, require_frame
+
+_VECTORS = ('weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip')
+_FARTHEST = 10.0
+_SOFTEST, _STIFFEST, _LARGEST = 1.0, 1e5, 0.1
+"""[N/m] of the coupling: a scene has a tenth of it at most; [m] of the proxy."""
 
 
 def tool_contact(message: Any, node_count: int) -> ToolContact:
     """A contact for the core.
 
     Args:
-        message: a `Contact` message as received, from anybody, or anything with its fields.
+        message: a `Contact` message as received, from anybody, or what a recorded frame has of it:
+            the same fields, but for the header.
         node_count: of the mesh.
 
     Raises:
-        ValueError: one sentence that says which field is wrong.
+        MessageError: one sentence that says which field is wrong.
     """
+    if hasattr(message, 'header'):
+        _check_header(message.header)
     if message.state > State.INSIDE:
-        raise ValueError(f'state {message.state} is none of 0, 1, 2')
-    for name in ('weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip'):
+        raise MessageError('no such state', f'state {message.state} is none of 0, 1, 2')
+    for name in _VECTORS:
         values = getattr(message, name)
-        if not np.isfinite(values).all() or np.abs(values).max() > 10:
-            raise ValueError(f'{name} {values.tolist()} is not finite or beyond 10')
-    if not 0 <= message.coupling_stiffness <= 1e5:
-        raise ValueError(f'coupling_stiffness {message.coupling_stiffness} is not in 0 to 1e5 N/m')
-    if not 0 <= message.proxy_radius <= 0.1:
-        raise ValueError(f'proxy_radius {message.proxy_radius} is not in 0 to 0.1 m')
+        if not (np.abs(values) <= _FARTHEST).all():  # a NaN is not
+            text = f'{name} {values.tolist()} is not finite or beyond {_FARTHEST:g}'
+            raise MessageError('not finite or too far', text)
+    if not _SOFTEST <= message.coupling_stiffness <= _STIFFEST:
+        stiffness, range_ = message.coupling_stiffness, f'{_SOFTEST:g} to {_STIFFEST:g} N/m'
+        raise MessageError(
+            'stiffness out of range', f'coupling_stiffness {stiffness} is not in {range_}'
+        )
+    if not 0 <= message.proxy_radius <= _LARGEST:
+        text = f'proxy_radius {message.proxy_radius} is not in 0 to {_LARGEST} m'
+        raise MessageError('radius out of range', text)
     if message.state == State.TOUCHING or message.weights.any():
         if message.nodes.max() >= node_count:
-            raise ValueError(f'nodes {message.nodes.tolist()} go beyond the {node_count} nodes')
+            text = f'nodes {message.nodes.tolist()} go beyond the {node_count} nodes'
+            raise MessageError('index out of range', text)
         if abs(message.weights.sum() - 1) > 1e-6 or message.weights.min() < -1e-6:
-            raise ValueError(f'weights {message.weights.tolist()} are not barycentric')
+            text = f'weights {message.weights.tolist()} are not barycentric'
+            raise MessageError('weights that are none', text)
         if abs(np.linalg.norm(message.normal) - 1) > 1e-6:
-            raise ValueError(f'normal {message.normal.tolist()} is not a unit vector')
+            text = f'normal {message.normal.tolist()} is not a unit vector'
+            raise MessageError('normal that is none', text)
     # A node of two touched triangles stands there twice.
     nodes, slots = np.unique(message.nodes.astype(np.int64), return_inverse=True)
     weights = np.bincount(slots, message.weights, len(nodes))
@@ -51,3 +68,9 @@ def tool_contact(message: Any, node_count: int) -> ToolContact:
         blade_tip=message.blade_tip,
         sequence=message.sequence,
     )
+
+
+def _check_header(header: Any) -> None:
+    require_frame('tool/contact', header.frame_id)
+    if header.stamp.nanosec >= 1_000_000_000:
+        raise MessageError('no such time', f'stamp has {header.stamp.nanosec} nanoseconds')

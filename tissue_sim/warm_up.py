@@ -12,7 +12,7 @@ from tissue_sim.coupling import Coupling
 from tissue_sim.dynamics import Dynamics, TimeStepping
 from tissue_sim.elasticity import MODELS
 from tissue_sim.integrators import INTEGRATORS
-from tissue_sim.locate import distance_to_triangles, locate_points
+from tissue_sim.locate import closest_triangle, distance_to_triangles, locate_points
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, TopologyDelta
 from tissue_sim.simulation import TissueSimulation
@@ -53,6 +53,7 @@ def warm_up() -> None:
     simulation.frame(None)
     mesh, far = simulation.mesh, np.full(3, 1.0)
     distance_to_triangles(far, simulation.positions, mesh.triangles)
+    closest_triangle(far, mesh.rest, mesh.triangles)
     locate_points(
         simulation.positions,
         mesh.tetrahedra,

@@ -64,7 +64,8 @@ class Markers:
     Args:
         frame: that the positions are in.
         colouring: what the colour of the tissue shows.
-        largest: what has the last colour: displacement [m] or stress [Pa].
+        largest: what has the last colour: displacement [m] or stress [Pa]; 0: 10 mm, or a tenth of
+            Young's modulus.
         youngs_modulus: [Pa], for stress.
         poissons_ratio: the same.
     """
@@ -77,7 +78,9 @@ class Markers:
         youngs_modulus: float,
         poissons_ratio: float,
     ) -> None:
-        self._frame, self._colouring, self._largest = frame, colouring, largest
+        usual = {'displacement': 0.01, 'von_mises': 0.1 * youngs_modulus}
+        self._frame, self._colouring = frame, colouring
+        self._largest = largest or usual[colouring]
         self._elasticity = youngs_modulus, poissons_ratio
 
     def array(

@@ -13,7 +13,6 @@ from cutting_trainer_msgs.msg import Contact, ForceSample
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.srv import SetParameters
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from visualization_msgs.msg import MarkerArray
 
@@ -21,24 +20,21 @@ from haptic_bridge.operating_state import E_STOP, State, crtk_types
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
 from haptic_bridge.wire import ContactCodec, PoseStampedCodec, StampedCodec, WrenchStampedCodec
 from tissue_sim import ros
+from tissue_sim.lifecycle import ManagedNode, Stop, announce_ready, run
 from tissue_sim.mesh_follower import MeshFollower
 from tissue_sim.parameters import parameter, scene_parameter
+from tissue_sim.refusals import MessageError
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
 from tissue_sim.share import share_folder
 from tissue_sim.timing import PeriodicLoop
-from viewer.frames import device_frame
+from viewer.frames import StaticFrames
 from viewer.history import Counter
 from viewer.live_page import LivePage, SessionState
 from viewer.markers import Colouring, Markers
 from viewer.moment import Moment, Translator
 from viewer.page import addresses, open_page
 from viewer.panel import Actions, NodeState
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ModuleNotFoundError:  # it is not among the wheels
-    TFMessage = None
 
 MARKER_PERIOD = 0.1
 """[s] between two sets of markers."""
@@ -47,11 +43,14 @@ HEARING = 0.1
 RATE = 30.0
 """Updates of the page [Hz], at most."""
 _NICENESS = 10
-BRIDGE = 'haptic_bridge'
+_MOST_NODES, _LONGEST_TEXT = 32, 1000
+"""Of what /diagnostics says: nodes in the table, characters of a text."""
+_FASTEST, _LAST_LEVEL = 1e6, 3
+BRIDGE, RECORDER = 'haptic_bridge', 'recorder'
 
 
 class Stream:
-    """The newest message of a fast topic, and how many a second there are.
+    """The newest valid message of a fast topic, and how many a second there are.
 
     Args:
         node: to subscribe with.
@@ -59,55 +58,59 @@ class Stream:
         codec: that reads them.
     """
 
-    def __init__(self, node: Node, message_type: Any, topic: str, codec: StampedCodec) -> None:
+    def __init__(
+        self, node: ManagedNode, message_type: Any, topic: str, codec: StampedCodec
+    ) -> None:
         self.newest: Any = None
         self.counter = Counter()
-        self._codec = codec
+        self._codec, self._topic, self._refusals = codec, topic, node.refusals
         self._subscription = ros.polled(node, message_type, topic, ros.NEWEST_BEST_EFFORT)
 
     def poll(self, now: float) -> None:
         """Takes what has come by a time [s]."""
         if (taken := ros.take_numbered(self._subscription)) is not None:
-            self.newest = self._codec.decode(taken[0])
             self.counter.see(now, taken[1])
+            try:
+                sample = self._codec.believed(taken[0])
+            except MessageError as error:
+                self._refusals.add(self._topic, error)
+                return
+            if sample.stamp_ns:  # else of no device yet
+                self.newest = sample
 
 
-class ViewerNode(Node):
+class ViewerNode(ManagedNode):
     """Shows the graph and operates it; see docs/view.md.
 
     Parameters:
         scene: path of the scene file.
         host, port: where the page is served; port 0: one that is free.
         marker_colour: of the tissue in `viewer/markers`: displacement or von_mises.
-        marker_largest: what has the last colour; [m] or [Pa].
+        marker_largest: what has the last colour [m] or [Pa]; 0: 0.01 m, or a tenth of Young's
+            modulus.
         session: a launcher reads `message: ...` on standard output and answers on standard input,
             so that nodes can be started again, and recorded.
     """
 
     def __init__(self) -> None:
         super().__init__('viewer')
+        self._listener: threading.Thread | None = None
+
+    def configure(self) -> None:
+        """Reads the scene, opens the page and makes the topics."""
         scene = Path(scene_parameter(self))
         host = str(parameter(self, 'host', '127.0.0.1', 'address that the page is served on'))
         text = 'port of the page; 0: one that is free'
         port = int(parameter(self, 'port', 8080, text, within=(0, 65535)))
-        text = 'of the tissue in viewer/markers: displacement or von_mises'
-        colouring = str(parameter(self, 'marker_colour', 'displacement', text))
-        if colouring not in get_args(Colouring):
-            known = ' or '.join(get_args(Colouring))
-            raise ValueError(f'marker_colour is {colouring!r}: use {known}')
-        text = 'what has the last colour [m] or [Pa]'
-        largest = float(parameter(self, 'marker_largest', 0.01, text))
-        if not largest > 0:
-            raise ValueError(f'marker_largest is {largest}: use a number above 0')
-        self._colouring: tuple[Any, float] = colouring, largest
+        self._colouring = self._marker_colours()
         text = 'a launcher reads standard output and answers on standard input'
         self._launched = bool(parameter(self, 'session', False, text))
         self._take_scene(scene)
-        self._follower = MeshFollower(self)
+        self._follower = MeshFollower(self, self.refusals)
         self._contact = Stream(self, Contact, ros.CONTACT, ContactCodec())
         self._wrench = Stream(self, WrenchStamped, f'{ros.ARM}/servo_cf', WrenchStampedCodec())
         self._pose = Stream(self, PoseStamped, f'{ros.ARM}/measured_cp', PoseStampedCodec())
-        self._frames = Counter()
+        self._reactions = Counter()
         self._samples = ros.polled(self, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
         self._connect()
         self._state: State | None = None
@@ -129,9 +132,20 @@ class ViewerNode(Node):
         self._page = LivePage(
             self._server, self._tool, actions, known_scenes(), self._guide, session=self._launched
         )
+        self._page.show_scale(self._force_scale)
         self._loop = PeriodicLoop(RATE)
         self._next_markers = 0.0
         self._diagnostics = ros.Diagnostics(self, self._status)
+
+    def _marker_colours(self) -> tuple[Any, float]:
+        """What the colour of the markers shows, and what has the last one; 0: by the scene."""
+        text = 'of the tissue in viewer/markers: displacement or von_mises'
+        colouring = str(parameter(self, 'marker_colour', 'displacement', text))
+        if colouring not in get_args(Colouring):
+            known = ' or '.join(get_args(Colouring))
+            raise ValueError(f'marker_colour is {colouring!r}: use {known}')
+        text = "what has the last colour [m] or [Pa]; 0: 0.01 m, or a tenth of Young's modulus"
+        return colouring, float(parameter(self, 'marker_largest', 0.0, text, within=(0.0, 1e12)))
 
     def _take_scene(self, scene: Path) -> None:
         device = read_section(scene, 'device', DeviceSettings)
@@ -142,9 +156,10 @@ class ViewerNode(Node):
         self._nominal = haptics.rate, tissue.integration.rate
         self._force_scale = haptics.force_scale
         material = tissue.material
-        elasticity = material.youngs_modulus, material.poissons_ratio
-        self._markers = Markers(ros.FRAME, *self._colouring, *elasticity)
-        self._frame = device_frame(device)
+        self._markers = Markers(
+            ros.FRAME, *self._colouring, material.youngs_modulus, material.poissons_ratio
+        )
+        self._device = device
 
     def _connect(self) -> None:
         types = crtk_types()
@@ -156,43 +171,36 @@ class ViewerNode(Node):
         self._goal = self.create_publisher(PoseStamped, ros.HAND, ros.EVENTS)
         self._setter = self.create_client(SetParameters, f'{BRIDGE}/set_parameters')
         self._marker_array = self.create_publisher(MarkerArray, ros.MARKERS, ros.EVENTS)
-        if TFMessage is None:
-            self.get_logger().info('tf2_msgs is not installed: /tf_static is not published')
-        else:
-            self._static = self.create_publisher(TFMessage, ros.STATIC_FRAMES, ros.LATCHED)
-            self._frame.header.stamp = self.get_clock().now().to_msg()
-            self._static.publish(TFMessage(transforms=[self._frame]))
+        self._frames = StaticFrames(self, self._device)
         for name, take in ((BRIDGE, self._bridge_state), (ros.ARM, self._arm_says)):
             topic = f'{name}/operating_state'
-            self.create_subscription(types.operating_state, topic, take, ros.LATCHED)
-        self.create_subscription(DiagnosticArray, ros.DIAGNOSTICS, self._take_status, ros.EVENTS)
+            ros.listen(self, types.operating_state, topic, take, ros.LATCHED)
+        ros.listen(self, DiagnosticArray, ros.DIAGNOSTICS, self._take_status, ros.EVENTS)
 
-    def work(self, stop: ros.Stop) -> None:
+    def work(self, stop: Stop) -> None:
         """Brings the page up to date, again and again."""
-        os.nice(_NICENESS)  # whoever looks on waits, not those who act
-        if self._launched:
-            threading.Thread(target=self._listen, daemon=True).start()
+        if self._launched and self._listener is None:
+            self._listener = threading.Thread(target=self._listen, daemon=True)
+            self._listener.start()
         self._tell(page=addresses(self._server))
-        ros.announce_ready(self)
+        announce_ready(self)
         self._loop.start()
         while not stop.is_set():
             self._loop.wait()
             self._tick(time.monotonic())
 
-    def close(self) -> None:
+    def release(self) -> None:
         """Ends the page."""
         self._server.stop()
 
     def _tick(self, now: float) -> None:
-        try:
-            self._follower.poll()
-        except ValueError as error:
-            self.get_logger().warning(f'mesh refused: {error}', throttle_duration_sec=1.0)
-            self._follower.ask()
+        self._follower.poll()
         for stream in (self._contact, self._wrench, self._pose):
             stream.poll(now)
+        if self._pose.newest is not None:
+            self._frames.learn(self._pose.newest.frame_id)
         if (taken := ros.take_numbered(self._samples)) is not None:
-            self._frames.see(now, taken[1])
+            self._reactions.see(now, taken[1])
         if now >= self._enable_at:
             self._enable_bridge()
         while self._answers:
@@ -204,7 +212,7 @@ class ViewerNode(Node):
             )
         rates = (
             self._wrench.counter.rate(now) / self._nominal[0],
-            self._frames.rate(now) / self._nominal[1],
+            self._reactions.rate(now) / self._nominal[1],
         )
         can_guide = self._state is State.ENABLED and self._goal.get_subscription_count() > 0
         self._page.show(now, self._follower.replica, moment, rates, can_guide=can_guide)
@@ -237,6 +245,7 @@ class ViewerNode(Node):
         self._send(self._to_bridge, 'resume' if self._state is State.PAUSED else 'enable')
 
     def _pause(self) -> None:
+        self._starting, self._enable_at = False, math.inf
         self._send(self._to_bridge, 'pause')
         self._send(self._to_arm, 'pause')
 
@@ -247,14 +256,14 @@ class ViewerNode(Node):
 
     def _send(self, publisher: Any, word: str) -> None:
         message = self._command(string=word)
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = ros.stamp(time.time_ns())
         publisher.publish(message)
 
     def _guide(self, position: Any, wxyz: Any) -> None:
         """Gives the emulated hand a goal in the tissue frame."""
         message = PoseStamped()
         message.header.frame_id = ros.FRAME
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = ros.stamp(time.time_ns())
         place, turn = message.pose.position, message.pose.orientation
         place.x, place.y, place.z = map(float, position)
         turn.w, turn.x, turn.y, turn.z = map(float, wxyz)
@@ -294,10 +303,13 @@ class ViewerNode(Node):
     def _take_answer(self, answer: SessionState) -> None:
         if answer.scene_file:
             self._take_scene(Path(answer.scene_file))
+            self._frames.place(self._device)
             self._page.equip(self._tool)
             self._page.show_scale(self._force_scale)
         if answer.busy:
             self._nodes.clear()
+        elif not answer.recording:
+            self._nodes.pop(RECORDER, None)  # its last words are heard when it has been ended
         self._page.show_session(answer)
 
     # What the nodes say
@@ -311,12 +323,19 @@ class ViewerNode(Node):
             self._enable_at = time.monotonic() + HEARING
 
     def _take_status(self, message: DiagnosticArray) -> None:
+        own = self.get_namespace().strip('/')
         for status in message.status:
+            name = name_within(own, status.name)
+            if not name:
+                continue  # another trainer's, beside this one
+            known = name in self._nodes or len(self._nodes) < _MOST_NODES
+            if not known or len(name) > _LONGEST_TEXT or len(status.message) > _LONGEST_TEXT:
+                raise MessageError('a status too many or too long', f'of {len(message.status)}')
             values = {pair.key: pair.value for pair in status.values}
-            rate = float(values.get('rate', 0.0))
-            level = status.level[0]
-            state = NodeState(status.name, level, status.message, rate)
-            self._nodes[status.name] = (time.monotonic(), state)
+            rate, level = float(values.get('rate', 0.0)), status.level[0]
+            if not 0 <= rate <= _FASTEST or level > _LAST_LEVEL:
+                raise MessageError('no such rate or level', f'rate {rate:g}, level {level}')
+            self._nodes[name] = (time.monotonic(), NodeState(name, level, status.message, rate))
 
     def _nodes_now(self, now: float) -> list[NodeState]:
         states = []
@@ -349,6 +368,12 @@ class ViewerNode(Node):
         return DiagnosticStatus.OK, f'{pages} page{"s" * (pages != 1)}', values
 
 
+def name_within(namespace: str, name: str) -> str:
+    """A name on /diagnostics as it is in a namespace ('': all); '' where it is not in it."""
+    prefix = f'{namespace}/' if namespace else ''
+    return name.removeprefix(prefix) if name.startswith(prefix) else ''
+
+
 def known_state(name: str) -> State | None:
     """One of CRTK's states; None where a foreign device says something else."""
     return next((state for state in State if state == name), None)
@@ -361,7 +386,10 @@ def known_scenes() -> list[str]:
 
 def main() -> None:
     """Runs the node."""
-    ros.run(ViewerNode, ViewerNode.work)
+    # Whoever looks on waits, not those who act. Threads that there are already would stay as they
+    # are, the one that serves the pages among them.
+    os.nice(_NICENESS)
+    run(ViewerNode)
 
 
 if __name__ == '__main__':

@@ -80,8 +80,9 @@ class Panel:
         gui = server.gui
         self._actions = actions
         self._recording = False
-        self._state = gui.add_html(state_html('', ''))
+        # First of all: no text above it that could grow and move it away from under the mouse.
         stop = gui.add_button('E-STOP', color='red', hint='No force at once, until Start')
+        self._state = gui.add_html(state_html('', ''))
         buttons = {
             'Start': (actions.start, 'Let the force in: after a pause, a stop, a fault'),
             'Pause': (actions.pause, 'No force; the hand stands still'),
@@ -143,8 +144,10 @@ class Panel:
             control.disabled = busy
 
     def show_scale(self, scale: float) -> None:
-        """Shows the force scale that holds."""
-        self._scale.value = scale
+        """Shows the force scale that holds; one beyond the slider's ends moves them."""
+        slider = self._scale
+        slider.min, slider.max = min(slider.min, scale), max(slider.max, scale)
+        slider.value = scale
 
 
 class Plots:
@@ -233,7 +236,8 @@ def state_html(state: str, text: str) -> str:
     return (
         f'<div style="margin:6px 10px;font-size:14px"><div style="background:{colour};color:white;'
         f'border-radius:6px;padding:6px 10px;font-weight:700">{shown}</div>'
-        f'<div style="padding:5px 2px;min-height:2.6em;color:#495057">{escape(text)}</div></div>'
+        '<div style="padding:5px 2px;height:4.6em;overflow:auto;color:#495057">'
+        f'{escape(text)}</div></div>'
     )
 
 

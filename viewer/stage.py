@@ -24,6 +24,9 @@ _LEAST_FORCE = 0.02
 _SPINE, _THICKNESS, _HANDLE = 0.005, 0.0008, 0.07
 """[m] Width and thickness of the blade as drawn, length of the handle."""
 _NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
+_LIP, _LIFT = 0.0010, 0.0004
+"""[m] Width of the line along the lips of a cut, and how far it is above them: by it alone is seen
+what has closed again, in a tissue without tension."""
 
 
 class TissueView:
@@ -60,6 +63,8 @@ class TissueView:
             )
             for kind, look in looks.items()
         }
+        self._name, self._offset = name, offset
+        self._lips: Any = None
 
     def show(self, replica: Surface) -> None:
         """Brings the page up to the replica: positions, and faces where they have changed."""
@@ -76,6 +81,21 @@ class TissueView:
                 if others:
                     mesh.visible = bool(len(faces))
                     mesh.faces = faces if len(faces) else _NOTHING[1]
+            self._show_lips(replica, others=others)
+
+    def _show_lips(self, replica: Surface, *, others: bool) -> None:
+        if others and self._lips is not None:
+            self._lips.remove()  # lines cannot become more or fewer
+            self._lips = None
+        if not len(self._drawn.lips.edges):
+            return
+        points = self._drawn.lips.points(replica.rest + replica.displacement, _LIFT)
+        if self._lips is None:
+            self._lips = self._server.scene.add_line_segments(
+                f'{self._name}/lips', points, OPENED, thickness=_LIP, position=self._offset
+            )
+        else:
+            self._lips.points = points
 
 
 class Stage:

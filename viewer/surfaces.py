@@ -33,6 +33,45 @@ def part(triangles: NDArray[np.int32], kinds: NDArray[np.uint8], kind: int) -> P
     return Part(nodes.astype(np.int64), faces.reshape(-1, 3).astype(np.uint32))
 
 
+class Lips(NamedTuple):
+    """Where what a cut has opened meets the outside.
+
+    Attributes:
+        edges: nodes of the tissue, shape (n, 2).
+        corners: of the outer triangle at each, as the surface has them, shape (n, 3).
+    """
+
+    edges: NDArray[np.int64]
+    corners: NDArray[np.int64]
+
+    def points(self, positions: NDArray[np.float64], lift: float) -> NDArray[np.float32]:
+        """Begin and end of each edge, somewhat above the surface [m], shape (n, 2, 3).
+
+        Args:
+            positions: of the tissue's nodes [m], shape (k, 3).
+            lift: how far above [m].
+        """
+        a, b, c = np.moveaxis(positions[self.corners], 1, 0)
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        return (positions[self.edges] + lift * normals[:, None]).astype(np.float32)
+
+
+def lips(triangles: NDArray[np.int32], kinds: NDArray[np.uint8]) -> Lips:
+    """The lips of all cuts.
+
+    Args:
+        triangles: node indices, shape (k, 3).
+        kinds: by triangle, shape (k,).
+    """
+    corners = triangles.astype(np.int64)
+    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2)
+    keys = edges.min(axis=1) * (corners.max(initial=0) + 1) + edges.max(axis=1)
+    opened = np.repeat(kinds == CUT, 3)
+    chosen = ~opened & np.isin(keys, keys[opened])
+    return Lips(edges[chosen], np.repeat(corners, 3, axis=0)[chosen])
+
+
 class Surface(Protocol):
     """A tissue as far as it is drawn: a `MeshReplica`, or whatever has the same fields."""
 
@@ -53,10 +92,6 @@ class Surface(Protocol):
         """OUTER or CUT, shape (k,)."""
 
     @property
-    def topology(self) -> int:
-        """Counts changes of connectivity."""
-
-    @property
     def revision(self) -> int:
         """Counts changes of any kind."""
 
@@ -66,20 +101,24 @@ class DrawnTissue:
 
     Attributes:
         parts: by kind, as of the last `follow`.
+        lips: of its cuts, the same.
     """
 
     def __init__(self) -> None:
         self.parts: dict[int, Part] = {}
-        self._known: tuple[object, int] = (None, -1)
+        self.lips = lips(np.zeros((0, 3), np.int32), np.zeros(0, np.uint8))
+        self._known = np.zeros((0, 3), np.int32), np.zeros(0, np.uint8)
 
     def follow(self, replica: Surface) -> bool:
         """Takes the replica's connectivity; whether the faces are others than before."""
         triangles, kinds = replica.triangles, replica.triangle_kind
-        base = triangles if triangles.base is None else triangles.base
-        if self.parts and self._known[0] is base and self._known[1] == replica.topology:
+        # By what they hold: a whole mesh comes every five seconds, mostly with the same faces.
+        known, of_kind = self._known
+        if self.parts and np.array_equal(triangles, known) and np.array_equal(kinds, of_kind):
             return False
-        self._known = base, replica.topology
+        self._known = triangles.copy(), kinds.copy()
         self.parts = {kind: part(triangles, kinds, kind) for kind in (OUTER, CUT)}
+        self.lips = lips(triangles, kinds)
         return True
 
     def positions(self, replica: Surface, kind: int) -> NDArray[np.float32]:

@@ -115,7 +115,7 @@ class ComputedTissue:
 
 
 class Samples:
-    """The messages of one fast topic, thinned out.
+    """The valid messages of one fast topic, thinned out.
 
     Args:
         bag: to read.
@@ -130,7 +130,7 @@ class Samples:
         times = []
         for message in bag.messages([topic]):
             seconds = (message.log_time - origin) * 1e-9
-            if seconds >= due:
+            if seconds >= due and codec.decode(message.data).stamp_ns:  # else of no device yet
                 due = seconds + _SPACING
                 self._data.append(message.data)
                 times.append(seconds)

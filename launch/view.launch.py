@@ -1,0 +1,13 @@
+"""The page, and the markers for RViz, of nodes that run: `http://127.0.0.1:8080`."""
+
+from launch.substitutions import LaunchConfiguration
+
+from launch import LaunchDescription
+from session.launching import declared, environment, nodes
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Declares the arguments and starts the viewer."""
+    arguments = declared('scene', 'host', 'port', 'namespace', 'arm')
+    viewer = nodes(('viewer',), device=LaunchConfiguration('arm'))
+    return LaunchDescription([*arguments, *environment(), *viewer])

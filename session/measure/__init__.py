@@ -1,0 +1,1 @@
+"""What measures models, cuts, haptics and timing, and writes the pages of docs/ about them."""

@@ -1,0 +1,146 @@
+"""What messages cost, a session as a whole, and the start of a node."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+from cutting.methods import make_method
+from cutting.settings import CuttingSettings
+from haptic_bridge.force_path import ForcePath
+from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from session.in_process import TICK, InProcess, Tissue
+from session.measure.bench_clock import Figure, by_turns, figure, stream
+from session.measure.bench_tissue import SIZE, box, liver_material
+from session.scene import load_scene
+from tissue_sim.blade import Resistance
+from tissue_sim.dynamics import TimeStepping
+from tissue_sim.mesh import TetMesh, TopologyDelta, Touched
+from tissue_sim.messages import DeltaEncoder, mesh_message
+from tissue_sim.replica import MeshReplica, state_hash
+from tissue_sim.simulation import TissueSimulation
+
+
+def codec(sizes: list[int]) -> list[Figure]:
+    """A delta of all nodes, one with a cut and a whole mesh: made, sent as bytes, and taken."""
+    return [row for size in sizes for row in _codec(box(size))]
+
+
+def _codec(mesh: TetMesh) -> list[Figure]:
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    u = np.random.default_rng(0).standard_normal((2, mesh.node_count, 3)) * 1e-4
+    whole = mesh_message(mesh, u[0], 'bench', 0, 0, 0)
+    moved = DeltaEncoder(mesh, u[0]).encode(u[1], 1, 0, None, 0)
+    assert moved is not None
+    mesh_bytes, delta_bytes = serialize_message(whole), serialize_message(moved)
+    touched = mesh.apply(TopologyDelta(removed_tetrahedra=np.array([0])))
+    before, after = u[:, : mesh.node_count]
+
+    def encode(cut: Touched | None) -> None:
+        DeltaEncoder(mesh, before).encode(after, 1, 0, cut, 0)
+
+    def take() -> None:
+        replica = MeshReplica()
+        replica.load(whole)
+        replica.apply(moved)
+
+    tasks = {
+        'encode a delta of all nodes': lambda: encode(None),
+        'encode a delta with a cut': lambda: encode(touched),
+        '  of it the hash': lambda: state_hash(mesh.rest, after, mesh.tetrahedra),
+        'serialise the delta': lambda: serialize_message(moved),
+        'read the delta': lambda: deserialize_message(delta_bytes, type(moved)),
+        'serialise the mesh': lambda: serialize_message(whole),
+        'read the mesh': lambda: deserialize_message(mesh_bytes, type(whole)),
+        'take mesh and delta into a replica': take,
+    }
+    times = by_turns(*tasks.values(), stream(len(delta_bytes)), repeats=5)
+    base = float(np.median(times[:, -1]))
+    against = f'reading the {len(delta_bytes)} bytes of the delta'
+    label = f'{len(mesh.tetrahedra)} tetrahedra'
+    return [
+        figure(f'{name}, {label}', 'ms', 1e3 * column, float(np.median(column)) / base, against)
+        for name, column in zip(tasks, times.T, strict=False)
+    ]
+
+
+def session(sizes: list[int], seconds: float = 2.0) -> list[Figure]:
+    """Force loop at 1 kHz and tissue at 30 Hz in one process: a press, then a cut by the blade."""
+    figures = []
+    scene = load_scene('liver')
+    m = scene.tissue.material
+    for size in sizes:
+        mesh = box(size)
+        simulation = TissueSimulation(
+            mesh,
+            liver_material(),
+            Resistance(scene.tissue.cut_threshold, m.toughness, m.blade_friction),
+            model='linear',
+            stepping=TimeStepping('symplectic_euler', max_substeps=1000),
+        )
+        device, haptics = DeviceSettings(), HapticsSettings()
+        tool = ToolSettings(
+            blade_root=(0.0, 0.0, 0.02), blade_tip=(0.0, 0.0, -0.004), coupling_stiffness=200.0
+        )
+        path = ForcePath(tool, device, haptics, device.load_profile())
+        loop = InProcess(path, Tissue(simulation, make_method(CuttingSettings())), 30.0)
+        ticks = round(seconds / TICK)
+        spent = np.empty(ticks)
+        for i in range(ticks):
+            down = min(2 * i / ticks, 1.0) * 0.012
+            along = max(2 * i / ticks - 1, 0.0) * 0.02
+            hand = np.array([0.04 + along, 0.05, SIZE[2] + 0.005 - down])
+            start = time.thread_time()
+            loop.tick(hand)
+            spent[i] = time.thread_time() - start
+        frames = [part.sum() for part in np.array_split(spent, round(30 * seconds))]
+        label = f'{len(mesh.tetrahedra)} tetrahedra, {simulation.elements_cut} cut'
+        figures += [
+            figure(
+                f'a thirtieth of a second, {label}',
+                'ms',
+                1e3 * np.array(frames),
+                float(spent.sum() / seconds),
+                'real time',
+            ),
+            figure(f'  tick without a frame, {label}', 'us', 1e6 * np.sort(spent)[: ticks // 2]),
+        ]
+    return figures
+
+
+_START = """
+import json, sys, time
+def now(): return time.monotonic()
+t = [now()]
+import tissue_sim.node, cutting.node, haptic_bridge.node
+t.append(now())
+from tissue_sim.warm_up import warm_up
+warm_up()
+t.append(now())
+from session.scene import load_scene
+from tissue_sim.assembly import make_simulation
+make_simulation(load_scene('liver').tissue)
+t.append(now())
+print(json.dumps([b - a for a, b in zip(t, t[1:])]))
+"""
+
+
+def start(repeats: int = 3) -> list[Figure]:
+    """A new process that becomes a tissue: wall-clock time, kernels from their cache."""
+    rows = []
+    for _ in range(repeats + 1):
+        began = time.monotonic()
+        done = subprocess.run(
+            [sys.executable, '-c', _START], capture_output=True, text=True, check=True
+        )
+        rows.append([time.monotonic() - began, *json.loads(done.stdout.splitlines()[-1])])
+    times = np.array(rows[1:])  # the first may compile
+    names = ('whole process', '  imports of the nodes', '  kernels', '  the tissue of liver')
+    total = float(np.median(times[:, 0]))
+    return [
+        figure(name, 's', column, float(np.median(column)) / total, names[0])
+        for name, column in zip(names, times.T, strict=True)
+    ]

@@ -1,0 +1,1 @@
+"""From the surface of an organ to a mesh and a scene."""

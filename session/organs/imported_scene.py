@@ -1,0 +1,214 @@
+"""The scene of an imported organ: what holds it, and a tool that starts above it and cuts it."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from session.errors import SessionError
+
+Points = NDArray[np.float64]
+
+HELD = 0.05
+"""Share of the nodes that are fixed, the lowest."""
+LEAST_HELD = 6
+TOOL_RADIUS = 0.004
+THINNEST = 0.003
+"""[m] that an organ must measure along each axis."""
+CUT_LENGTH = 0.04
+
+_SCENE = """\
+# {source}, imported: {nodes} nodes, {tetrahedra} tetrahedra, edges of about {edge:.2g} mm.
+# Lengths in m. Tissue frame: z up, origin at the centre of the underside. All keys: docs/scenes.md.
+
+tissue:
+  mesh: {mesh}
+  unit: m
+  material:
+    preset: liver_elastography
+    # Lower than measured, so that the tissue opens before it has yielded by centimetres.
+    toughness: 10
+    blade_friction: 2
+  damping: {{alpha: 15, beta: 1.0e-4}}
+  # What does not move: the underside. Give boxes instead to hold it elsewhere.
+  fixed:
+    - below: {{axis: z, value: {held:.6g}}}
+  cut_threshold: {threshold:.3g}
+  budget: {{displacement: {press:.3g}, rotation: 30, contact_radius: {contact:.3g}, error: 0.25}}
+  model: corotational_smoothed
+  integrator: symplectic_euler
+  integration: {{rate: 30, safety: 0.8, frequency_growth: 2, max_substeps: 400}}
+
+tool:
+  radius: {radius:.4g}
+  coupling_stiffness: 200
+  # Tool frame: origin at the tip (centre of the sphere), z up the handle; the blade cuts along +x.
+  blade_root: [0, 0, {root:.4g}]
+  blade_tip: [0, 0, {tip:.4g}]
+
+device:
+  profile: emulated
+  tissue_from_device:
+    translation: [{x:.6g}, {y:.6g}, {above:.6g}]
+    rotation_rpy_deg: [0, 0, 0]
+    scale: 1
+
+haptics:
+  extrapolation: local_stiffness
+
+cutting:
+  method: combined
+
+arm:
+  mass: 0.1
+  viscous_friction: 0.3
+  coulomb_friction: 0.03
+  hand: {{stiffness: 400, damping: 8, tremor: 0}}
+  script:
+    # Positions are of the tip; it touches where it is one radius above the surface.
+    start: {{position: {start}, rpy_deg: [0, 0, 0]}}
+    seconds: 16
+    phases:
+      - kind: approach
+        share: 2
+        waypoints:
+          - {{position: {near}}}
+      - kind: palpate
+        share: 4
+        waypoints:
+          - {{position: {pressed}, share: 2}}
+          - {{position: {near}}}
+      - kind: approach
+        name: to the cut
+        share: 1.5
+        waypoints:
+          - {{position: {over}}}
+      - kind: cut
+        share: 6
+        waypoints:  # in, up to where the end of the blade is some {deep:.2g} mm deep, along, out
+          - {{position: {pushed_in}, share: 2}}
+          - {{position: {first}}}
+          - {{position: {middle}, share: 1.5}}
+          - {{position: {last}, share: 1.5}}
+          - {{position: {out}}}
+      - kind: retract
+        share: 1.5
+        waypoints:
+          - {{position: {end}}}
+
+session:
+  seconds: 16
+"""
+
+
+def require_thick(source: Path, size: Points) -> None:
+    """Refuses an organ that a blade could neither press nor cut.
+
+    Args:
+        source: the surface file.
+        size: of the organ along the axes [m], shape (3,).
+
+    Raises:
+        SessionError: it is too thin.
+    """
+    if size.min() < THINNEST:
+        raise SessionError(
+            f'{source} is {1e3 * size.min():.2g} mm thick, less than {1e3 * THINNEST:g} mm: too '
+            'thin to press and cut; is the unit right (--unit)?'
+        )
+
+
+def scene_text(
+    mesh: str, source: str, nodes: Points, tetrahedra: NDArray[np.int32], edge: float
+) -> str:
+    """A scene that palpates the highest place and cuts along x across it.
+
+    Args:
+        mesh: name of the mesh file, which lies beside the scene.
+        source: name of the surface file, for the heading.
+        nodes: [m], z up, the underside at 0, shape (n, 3).
+        tetrahedra: shape (m, 4).
+        edge: length that was aimed at [m].
+    """
+    size = np.ptp(nodes, axis=0)
+    radius = min(TOOL_RADIUS, size.min() / 6)
+    x, y, top = nodes[nodes[:, 2].argmax()]
+    ends, heights = _line(nodes, tetrahedra, np.array([x, y]), min(CUT_LENGTH, size[0] / 2))
+
+    def at(place: float, above: float) -> str:
+        height = np.interp(place, ends, heights)
+        return f'[{place:.5g}, {y:.5g}, {height + above:.5g}]'
+
+    low, high, middle = ends[0], ends[-1], float(ends.mean())
+    press = radius
+    free = max(heights) - min(heights) + 4 * radius
+    return _SCENE.format(
+        mesh=mesh,
+        source=source,
+        nodes=len(nodes),
+        tetrahedra=len(tetrahedra),
+        edge=1e3 * edge,
+        held=_held(nodes, edge),
+        threshold=0.15 * radius / TOOL_RADIUS,
+        press=press,
+        contact=2 * radius,
+        radius=radius,
+        root=5 * radius,
+        tip=-radius,
+        x=x,
+        y=y,
+        above=top + 4 * radius,
+        start=at(x, 8 * radius),
+        near=at(x, 3 * radius),
+        pressed=at(x, radius - press),
+        over=at(low, free),
+        pushed_in=at(low, -3.5 * radius),
+        first=at(low, -1.5 * radius),
+        middle=at(middle, -1.5 * radius),
+        last=at(high, -1.5 * radius),
+        out=at(high, 4 * radius),
+        end=at(high, 8 * radius),
+        deep=2.5e3 * radius,
+    )
+
+
+def _held(nodes: Points, edge: float) -> float:
+    """Height up to which nodes are fixed [m]: enough of them, but at most half of the organ."""
+    heights = np.sort(nodes[:, 2])
+    enough = heights[min(max(LEAST_HELD, round(HELD * len(heights))), len(heights)) - 1]
+    return float(min(max(enough, 0.1 * edge), heights[-1] / 2))
+
+
+def _line(
+    nodes: Points, tetrahedra: NDArray[np.int32], centre: Points, length: float
+) -> tuple[Points, Points]:
+    """Where along x the organ lies under the line, and its height there [m], shape (k,) each."""
+    places = np.linspace(-length / 2, length / 2, 13)
+    heights = np.array(
+        [height(nodes, tetrahedra, centre + np.array([offset, 0.0])) for offset in places], float
+    )
+    # the part around the centre that has tissue under it, and not much lower
+    good = heights > heights[6] - length / 5
+    first = 6 - int(np.argmin([*good[6::-1], False]) - 1)
+    last = 6 + int(np.argmin([*good[6:], False]) - 1)
+    return centre[0] + places[first : last + 1], heights[first : last + 1]
+
+
+def height(nodes: Points, tetrahedra: NDArray[np.int32], place: Points) -> float:
+    """Largest z of the solid over a place [m]; -inf where there is nothing.
+
+    Args:
+        nodes: [m], shape (n, 3).
+        tetrahedra: shape (m, 4).
+        place: x and y [m], shape (2,).
+    """
+    faces = tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    a, b, c = (nodes[faces[:, i]] for i in range(3))
+    u, v, w = b[:, :2] - a[:, :2], c[:, :2] - a[:, :2], place - a[:, :2]
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        s = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
+        t = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
+        inside = (s >= -1e-9) & (t >= -1e-9) & (s + t <= 1 + 1e-9)
+        z = a[:, 2] + s * (b[:, 2] - a[:, 2]) + t * (c[:, 2] - a[:, 2])
+    return float(z[inside].max(initial=-np.inf))

@@ -1,0 +1,95 @@
+"""Fills a closed surface with tetrahedra by fTetWild, in a process of its own.
+
+Of its own, because the mesher is native code: it may end the process, and takes no interrupt. Run
+as `python -m session.organs.mesher IN.npz OUT.npz`.
+"""
+
+import subprocess
+import sys
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from session.errors import SessionError
+from tissue_sim.errors import MeshError
+from tissue_sim.mesh_checks import check_mesh
+
+ATTEMPTS = 3
+"""fTetWild is not deterministic: where a mesh is no conforming solid, another one may be."""
+HOW_TO_GET_IT = (
+    'this needs a mesher, which is not installed: run '
+    '`./trainer run python -m pip install -r requirements-mesh.txt` (x86-64), or make a mesh of '
+    'tetrahedra with another one and write a scene for it (docs/own-organ.md)'
+)
+
+
+def fill(
+    vertices: NDArray[np.float64], triangles: NDArray[np.int32], edge: float, envelope: float
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Fills a closed surface.
+
+    Args:
+        vertices: [m], shape (v, 3).
+        triangles: shape (t, 3).
+        edge: length of edge that is aimed at [m].
+        envelope: how far the surface may move [m].
+
+    Returns:
+        nodes [m], shape (n, 3), and tetrahedra that `check_mesh` accepts, shape (m, 4).
+
+    Raises:
+        SessionError: there is no mesher, or it does not make such a mesh.
+    """
+    if find_spec('pytetwild') is None:
+        raise SessionError(HOW_TO_GET_IT)
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    reason = ''
+    with tempfile.TemporaryDirectory(prefix='trainer-') as folder:
+        given, made = Path(folder, 'surface.npz'), Path(folder, 'solid.npz')
+        np.savez(
+            given, vertices=vertices, triangles=triangles, edge=edge, epsilon=envelope / diagonal
+        )
+        for _ in range(ATTEMPTS):
+            command = [sys.executable, '-m', 'session.organs.mesher', str(given), str(made)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                reason = (done.stderr.strip().splitlines() or [f'status {done.returncode}'])[-1]
+                continue
+            with np.load(made) as solid:
+                nodes, tetrahedra = solid['nodes'], solid['tetrahedra']
+            try:
+                return nodes, check_mesh(nodes, tetrahedra)
+            except MeshError as error:
+                reason = str(error)
+    raise SessionError(
+        f'no mesh could be made with edges of {1e3 * edge:.3g} mm: {reason}; try another --edge, '
+        'or smooth and simplify the surface'
+    )
+
+
+def _run(given: str, made: str) -> None:
+    import pytetwild
+
+    with np.load(given) as surface:
+        nodes, tetrahedra = pytetwild.tetrahedralize(
+            surface['vertices'],
+            surface['triangles'],
+            edge_length_abs=float(surface['edge']),
+            epsilon=float(surface['epsilon']),
+            stop_energy=8.0,
+            coarsen=True,
+            num_threads=1,
+            vtk_ordering=True,
+            quiet=True,
+        )
+    used, renumbered = np.unique(tetrahedra, return_inverse=True)
+    np.savez(
+        made, nodes=nodes[used], tetrahedra=renumbered.reshape(tetrahedra.shape).astype(np.int32)
+    )
+
+
+if __name__ == '__main__':
+    _run(*sys.argv[1:])

@@ -1,0 +1,172 @@
+"""An operator who guides the hand of a session, enables its force, and notes what becomes of it."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import rclpy
+from cutting_trainer_msgs.msg import ForceSample, MeshDelta
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from scipy.spatial.transform import Rotation
+from std_msgs.msg import String
+
+from haptic_bridge.operating_state import State, crtk_types
+from haptic_bridge.wire import WrenchStampedCodec
+from session.graph import BRIDGE_NODE
+from session.scene import Scene
+from session.trials.chaos_verdict import Witnessed
+from tissue_sim import ros
+
+POLL = 0.002
+GOAL_PERIOD = 1 / 60
+ASK_PERIOD = 0.5
+FAULTS = 'chaos/fault'
+
+
+class Operator:
+    """Guides the hand, enables arm and bridge whenever they are not, and notes what it sees.
+
+    Runs in a thread of its own. It is what a person would be: nothing else enables a force.
+
+    Args:
+        scene: of which the hand follows the script, again and again, each time at another place.
+        domain: ROS domain.
+        seed: of those places.
+        seconds: that the script is stretched to [s]; 0: its own.
+        forged: whether a message of a topic is none of the session's nodes': it is not looked at.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        domain: int,
+        seed: int,
+        seconds: float = 0.0,
+        forged: Callable[[str, bytes], bool] = lambda topic, data: False,
+    ) -> None:
+        self.seen = Witnessed()
+        self._forged = forged
+        self._seconds = seconds or scene.arm.script.seconds
+        script = scene.arm.script
+        points = [w.position for phase in script.phases for w in phase.waypoints]
+        self._path = np.array([script.start.position, *points])
+        self._turn = Rotation.from_euler('xyz', script.start.rpy_deg, degrees=True).as_quat()
+        self._random = np.random.default_rng(seed)
+        self._began = time.monotonic()
+        self._round, self._shift = -1, np.zeros(3)
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = node = Node('operator', context=self._context)
+        types = crtk_types()
+        self._command_type = types.command
+        self._wrench = WrenchStampedCodec()
+        self._servo = ros.polled(node, WrenchStamped, f'{ros.ARM}/servo_cf', ros.STREAM)
+        self._felt = ros.polled(node, WrenchStamped, f'{ros.ARM}/measured_cf', ros.STREAM)
+        self._force = ros.polled(node, ForceSample, ros.FORCE, ros.STREAM)
+        self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
+        self._goals = node.create_publisher(PoseStamped, ros.HAND, ros.EVENTS)
+        self._states = {
+            name: ros.polled(node, types.operating_state, f'{name}/operating_state', ros.LATCHED)
+            for name in (ros.ARM, BRIDGE_NODE)
+        }
+        self._commands = {
+            name: node.create_publisher(types.command, f'{name}/state_command', ros.EVENTS)
+            for name in self._states
+        }
+        self._newest: dict[str, Any] = {}
+        self._told = node.create_publisher(String, FAULTS, ros.HISTORY)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(node)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def now(self) -> float:
+        """[s] since it began."""
+        return time.monotonic() - self._began
+
+    def tell(self, what: str) -> None:
+        """Says what is done to a node, for the bag."""
+        self._told.publish(String(data=what))
+
+    def take_seen(self) -> Witnessed:
+        """What was seen since this was last asked: it takes 24 MB a minute."""
+        seen, self.seen = self.seen, Witnessed()
+        return seen
+
+    def end(self) -> None:
+        """Ends the thread and leaves the graph."""
+        self._stop.set()
+        self._thread.join()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def _run(self) -> None:
+        goal_due = ask_due = 0.0
+        while not self._stop.is_set():
+            time.sleep(POLL)
+            self._listen()
+            self._executor.spin_once(timeout_sec=0)
+            now = self.now
+            if now >= goal_due:
+                goal_due = now + GOAL_PERIOD
+                self._goals.publish(self._goal(now))
+            if now >= ask_due:
+                ask_due = now + ASK_PERIOD
+                self._enable(now)
+
+    def _enable(self, now: float) -> None:
+        """Asks for what is missing to a force: of the arm first, else the bridge refuses."""
+        for name in (ros.ARM, BRIDGE_NODE):
+            newest = self._newest.get(name)
+            if newest is not None and not newest.is_homed:
+                word = 'home'
+            elif newest is None or newest.state != State.ENABLED:
+                word = 'resume' if newest and newest.state == State.PAUSED else 'enable'
+            else:
+                continue
+            if name == BRIDGE_NODE:
+                self.seen.enabled.append(now)
+            self._commands[name].publish(self._command_type(string=word))
+
+    def _take(self, subscription: Any) -> Iterator[bytes]:
+        """What nodes of the session have said since the last time."""
+        topic = subscription.topic_name
+        while (data := ros.take_raw(subscription)) is not None:
+            if not self._forged(topic, data):
+                yield data
+
+    def _listen(self) -> None:
+        seen = self.seen
+        for subscription, rows in ((self._servo, seen.commanded), (self._felt, seen.felt)):
+            for raw in self._take(subscription):
+                sample = self._wrench.decode(raw)
+                rows.append((self.now, sample.stamp_ns * 1e-9, *sample.values[:3]))
+        for _ in self._take(self._force):
+            seen.samples.append(self.now)
+        for raw in self._take(self._updates):
+            seen.topologies.append((self.now, ros.read(raw, MeshDelta).topology))
+        for name, states in self._states.items():
+            for raw in self._take(states):
+                self._newest[name] = state = ros.read(raw, states.msg_type)
+                if name == BRIDGE_NODE:
+                    seen.states.append((self.now, state.state))
+
+    def _goal(self, now: float) -> PoseStamped:
+        moment = now / self._seconds
+        if int(moment) != self._round:
+            self._round = int(moment)
+            self._shift[:2] = self._random.uniform(-0.004, 0.004, 2)
+        at = (moment % 1.0) * (len(self._path) - 1)
+        position = [np.interp(at, np.arange(len(self._path)), axis) for axis in self._path.T]
+        goal = PoseStamped()
+        goal.header.frame_id, goal.header.stamp = ros.FRAME, ros.stamp(time.time_ns())
+        p, q = goal.pose.position, goal.pose.orientation
+        p.x, p.y, p.z = (float(x) for x in np.array(position) + self._shift)
+        q.x, q.y, q.z, q.w = (float(x) for x in self._turn)
+        return goal

@@ -1,0 +1,74 @@
+"""Claims about what `bench` prints: sound figures of every benchmark, at any size."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from meshes import box as block
+
+from session.errors import SessionError
+from session.measure import bench
+from session.measure.bench_flow import session
+from session.measure.bench_proxy import proxy
+from session.measure.bench_scaling import line, measure
+from session.measure.bench_tissue import box, moved_bytes
+from session.options import Bench
+from tissue_sim.elasticity import ElasticModel
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh
+
+
+@pytest.fixture(scope='module', autouse=True)
+def _short() -> None:
+    bench.BENCHES = bench.BENCHES | {
+        Bench.PROXY: (lambda: proxy(repeats=1, ticks=50), []),
+        Bench.SESSION: (lambda sizes: session(sizes, seconds=0.2), [300]),
+        Bench.START: (lambda: bench.start(repeats=1), []),
+    }
+
+
+@pytest.mark.parametrize('name', list(Bench))
+def test_each_benchmark_gives_sound_figures_as_json(
+    name: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sizes = [] if name in (Bench.PROXY, Bench.START) else [300]
+    bench.run_bench([name], sizes, as_json=True, save=False)
+    report: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert list(report['figures']) == ['memory', name.value]
+    rows = [row for rows in report['figures'].values() for row in rows]
+    assert len({row['name'] for row in rows}) == len(rows)
+    for row in rows:
+        assert 0 <= row['low'] <= row['median'] <= row['high'] < math.inf
+        assert (row['ratio'] is None) == (row['against'] == '')
+
+
+def test_a_size_for_a_benchmark_that_has_none_is_refused() -> None:
+    with pytest.raises(SessionError, match='has no size'):
+        bench.run_bench([Bench.START], [300], as_json=True, save=False)
+
+
+def test_a_box_has_about_as_many_tetrahedra_as_it_is_asked_for() -> None:
+    for size in (1000, 10_000):
+        assert 0.75 * size < len(box(size).tetrahedra) < 1.25 * size
+
+
+def test_the_bytes_model_counts_each_edge_once_and_each_neighbour_of_a_domain() -> None:
+    nodes, tets = block((2, 2, 2), 0.01)
+    mesh, n = TetMesh(nodes, tets), len(nodes)
+    pairs = np.sort(np.concatenate([tets[:, [i, j]] for i in range(4) for j in range(i)]), axis=1)
+    edges = len(np.unique(pairs, axis=0))
+    material = Material(3000.0, 0.4, 1000.0)
+    linear = moved_bytes(ElasticModel(mesh, material, 'linear'))
+    assert linear == edges * (9 * 8 + 4) + n * (6 * 8 + 2 * 8 + 4 * 3 * 8)
+    inside = int(((nodes > 1e-9) & (nodes < 0.02 - 1e-9)).all(axis=1).sum())
+    smoothed = moved_bytes(ElasticModel(mesh, material, 'linear_smoothed'))
+    assert smoothed == linear + (2 * edges + n - inside) * (3 * 8 + 4) + n * 24
+
+
+def test_an_exponent_is_that_of_the_power_law() -> None:
+    found = line('cost', [1000, 10_000, 100_000], [2e-3 * 10**1.5, 2e-3 * 100**1.5, 2.0 * 1e3**0.5])
+    assert found.steepest == pytest.approx(1.5)
+    assert line('flat', [1000, 8000], [3.0, 3.0]).exponent == pytest.approx(0.0)
+    assert {entry.name for entry in measure([600, 2500])} >= {'cut batch', 'encode, all nodes'}

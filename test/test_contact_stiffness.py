@@ -1,0 +1,130 @@
+"""What a tool is told of the tissue beside the force: stiffness here, ahead, and from afar."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from meshes import box
+
+from tissue_sim.compliance import solve_static
+from tissue_sim.contact import State, ToolContact
+from tissue_sim.contact_stiffness import ContactStiffness, spring_of
+from tissue_sim.coupling import Coupling
+from tissue_sim.dynamics import Dynamics
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh
+
+SIZE, TOP, RADIUS, SPRING = 0.008, 0.024, 0.004, 200.0
+UP, REST = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+AT = np.array([0.0265, 0.0225])
+"""[m] x and y of the contact, in a triangle of the upper side."""
+FRAME = 1 / 30
+
+
+def tissue() -> Dynamics:
+    nodes, tets = box((6, 6, 3), SIZE)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    material = Material(3000.0, 0.45, 1000.0, 15.0, 1e-4)
+    return Dynamics(mesh, material, 'linear_smoothed', None, None)
+
+
+def touched(mesh: TetMesh, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes of the triangle of the upper side over a place, and its barycentric weights there."""
+    for nodes in mesh.triangles[(mesh.rest[mesh.triangles][:, :, 2] > TOP - 1e-9).all(axis=1)]:
+        corners = np.vstack([mesh.rest[nodes][:, :2].T, np.ones(3)])
+        weights = np.linalg.solve(corners, [*place, 1.0])
+        if (weights >= 0).all():
+            return nodes.astype(np.int64), weights
+    raise AssertionError(f'nothing lies under {place}')
+
+
+def contact(mesh: TetMesh, gap: float) -> ToolContact:
+    """A tool over the place `AT`, by a gap [m]; below 0 it presses."""
+    nodes, weights = touched(mesh, AT)
+    height = gap + RADIUS
+    return ToolContact(
+        state=State.TOUCHING if gap < 0 else State.NONE,
+        topology=mesh.topology,
+        nodes=nodes,
+        weights=weights,
+        device=np.array([*AT, TOP + height]),
+        offset=max(height, RADIUS) * UP,
+        normal=UP,
+        stiffness=SPRING,
+        radius=RADIUS,
+        blade_root=REST,
+        blade_tip=REST,
+    )
+
+
+def stiffness_at(dynamics: Dynamics, place: np.ndarray) -> float:
+    """Of tissue and spring in series under a place, by a static solution [N/m]."""
+    nodes, weights = touched(dynamics.mesh, place)
+    load = np.zeros_like(dynamics.mesh.rest)
+    load[nodes, 2] = weights
+    moved = solve_static(dynamics.model, dynamics.inverse_mass > 0, load)
+    return 1 / (1 / SPRING + weights @ moved[nodes, 2])
+
+
+@pytest.mark.parametrize('direction', [(1.0, 0.0), (0.0, 1.0), (-0.6, 0.8), (0.8, -0.6)])
+def test_a_sliding_tool_is_told_the_stiffness_of_where_it_will_be(direction) -> None:
+    dynamics = tissue()
+    pressing = contact(dynamics.mesh, -0.004)
+    spring, force, way = spring_of(pressing), 0.1 * UP, 2e-3 * np.array([*direction, 0.0])
+    told = ContactStiffness(dynamics)
+    for _ in range(40):
+        matrix = told.matrix(spring, pressing, way, force)
+    here, ahead = stiffness_at(dynamics, AT), stiffness_at(dynamics, AT + 1.2 * way[:2])
+    assert abs(ahead / here - 1) > 0.03
+    assert np.trace(matrix) == pytest.approx(here, rel=1e-4)
+    # F = k d, so along the way the force changes by d times the change of k.
+    drop = -UP @ matrix @ (1.2 * way)
+    assert drop == pytest.approx((ahead - here) * 0.1 / here, rel=1e-3)
+    np.testing.assert_allclose(matrix @ np.cross(UP, way), 0.0, atol=1e-9)
+    np.testing.assert_allclose(matrix[:2], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize('way', [REST, 0.003 * UP, np.array([4e-5, 0.0, 0.0])])
+def test_a_tool_that_does_not_go_along_the_surface_is_told_of_no_change_along_it(way) -> None:
+    dynamics = tissue()
+    pressing = contact(dynamics.mesh, -0.004)
+    matrix = ContactStiffness(dynamics).matrix(spring_of(pressing), pressing, way, 0.1 * UP)
+    np.testing.assert_array_equal(matrix, matrix[2, 2] * np.outer(UP, UP))
+
+
+@pytest.mark.parametrize('stiffness', [1.0, SPRING, 1e5])
+def test_no_contact_however_forged_makes_it_much_stiffer_than_the_coupling(stiffness) -> None:
+    dynamics = tissue()
+    pressing = replace(contact(dynamics.mesh, -0.004), stiffness=stiffness)
+    way = np.array([0.002, 0.0, 0.0])
+    for force in (1e3, 1e6):  # a depth of metres, as no proxy has it
+        matrix = ContactStiffness(dynamics).matrix(spring_of(pressing), pressing, way, force * UP)
+        assert np.trace(matrix) <= stiffness
+        assert matrix[2, 0] != 0
+        assert np.abs(matrix).max() <= 4.001 * stiffness
+
+
+def told_after(seconds: float, gap: float, speed: float) -> float:
+    """Stiffness [N/m] that a free tool at a gap [m] is told after a while; 0: nothing."""
+    dynamics = tissue()
+    told, free = ContactStiffness(dynamics), contact(dynamics.mesh, gap)
+    for _ in range(round(seconds / FRAME)):
+        matrix = told.matrix(Coupling(), free, speed * FRAME * UP, REST)
+    return float(np.trace(matrix))
+
+
+def test_a_free_tool_is_told_what_it_would_meet_if_it_can_be_there_before_it_is_told_more() -> None:
+    far, soon = 0.05, 0.2
+    assert told_after(0.2, far, 0.0) > 0  # roughly, once, from anywhere
+    assert told_after(1.0, far, 0.0) == 0
+    assert told_after(1.0, far, 0.05) == 0
+    assert told_after(1.0, far, far / soon) == pytest.approx(stiffness_at(tissue(), AT), rel=1e-3)
+    assert told_after(1.0, 0.005, 0.0) == pytest.approx(stiffness_at(tissue(), AT), rel=1e-3)
+
+
+def test_nothing_is_foretold_of_another_connectivity_or_where_no_place_is_named() -> None:
+    dynamics = tissue()
+    told, free = ContactStiffness(dynamics), contact(dynamics.mesh, 0.005)
+    nowhere = replace(free, nodes=free.nodes[:0], weights=free.weights[:0])
+    for other in (replace(free, topology=free.topology + 1), nowhere, None):
+        assert not told.matrix(Coupling(), other, REST, REST).any()

@@ -1,0 +1,139 @@
+"""Every node configures, activates, rests, cleans up and shuts down when it is told to."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+import rclpy
+from geometry_msgs.msg import WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from live import ROOT, free_domain, two_presses, wait_for, write_scene
+from rclpy.node import Node
+
+from haptic_bridge.wire import WrenchStampedCodec
+from session.graph import MODULES, node_environment
+from tissue_sim.ros import NEWEST_BEST_EFFORT, polled, take_raw
+
+pytestmark = pytest.mark.real_time
+
+
+class Manager:
+    """A lifecycle manager of one node, which runs as a process of its own."""
+
+    def __init__(self, name: str, scene: Path, folder: Path, domain: int) -> None:
+        self._said: str | None = None
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node('manager', context=self.context)
+        self._executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        own = {'recorder': ['-p', f'bag:={folder / "bag"}'], 'viewer': ['-p', 'port:=0']}
+        arguments = ['--ros-args', '-p', f'scene:={scene}', '-p', 'autostart:=false']
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', MODULES[name], *arguments, *own.get(name, [])],
+            cwd=ROOT,
+            env=node_environment(domain),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._change = self.node.create_client(ChangeState, f'{name}/change_state')
+        self._get = self.node.create_client(GetState, f'{name}/get_state')
+        wait_for(self._get.service_is_ready, f'{name} to be there')
+
+    def _ask(self, client: Any, request: Any) -> Any:
+        future = client.call_async(request)
+        self._executor.spin_until_future_complete(future, 60.0)
+        return future.result()
+
+    def change(self, transition: int) -> str:
+        """Asks for a transition, and returns the state that the node is in then."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert self._ask(self._change, request) is not None
+        return self.state()
+
+    def state(self) -> str:
+        answer = self._ask(self._get, GetState.Request())
+        return str(answer.current_state.label)
+
+    def close(self) -> str:
+        if self._said is not None:
+            return self._said
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+        self.process.kill()
+        self._said = self.process.communicate()[0]
+        return self._said
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path
+
+
+@pytest.fixture
+def managers(folder: Path) -> Iterator[Any]:
+    made: list[Manager] = []
+    scene = write_scene(folder, two_presses(), 7.0, 100.0)
+    domain = free_domain()
+
+    def make(name: str, path: Path = scene) -> Manager:
+        made.append(Manager(name, path, folder, domain))
+        return made[-1]
+
+    yield make
+    for manager in made:
+        print(manager.close())
+
+
+@pytest.mark.parametrize('name', MODULES)
+def test_node_goes_through_its_life_and_a_second_one(managers: Any, name: str) -> None:
+    node = managers(name)
+    assert node.state() == 'unconfigured'
+    assert node.change(Transition.TRANSITION_DEACTIVATE) == 'unconfigured'
+    for _ in range(2):
+        assert node.change(Transition.TRANSITION_CONFIGURE) == 'inactive'
+        assert node.change(Transition.TRANSITION_ACTIVATE) == 'active'
+        assert node.change(Transition.TRANSITION_DEACTIVATE) == 'inactive'
+        assert node.change(Transition.TRANSITION_CLEANUP) == 'unconfigured'
+    node.change(Transition.TRANSITION_CONFIGURE)
+    node.change(Transition.TRANSITION_ACTIVATE)
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVE_SHUTDOWN))
+    node._change.call_async(request)
+    assert node.process.wait(30) == 0
+
+
+def test_node_with_a_bad_scene_stays_unconfigured_says_why_and_lives(
+    managers: Any, folder: Path
+) -> None:
+    scene = folder / 'bad.yaml'
+    scene.write_text('tissue: {mesh: nowhere.msh}\n')
+    node = managers('tissue_sim', scene)
+    assert node.change(Transition.TRANSITION_CONFIGURE) == 'unconfigured'
+    assert node.process.poll() is None
+    assert 'nowhere.msh' in node.close()
+
+
+def test_a_bridge_that_rests_leaves_no_force_and_comes_back_without_one(managers: Any) -> None:
+    nodes = {name: managers(name) for name in ('tissue_sim', 'emulated_arm', 'haptic_bridge')}
+    bridge = nodes['haptic_bridge']
+    for node in nodes.values():
+        node.change(Transition.TRANSITION_CONFIGURE)
+        node.change(Transition.TRANSITION_ACTIVATE)
+    forces = polled(bridge.node, WrenchStamped, 'arm/servo_cf', NEWEST_BEST_EFFORT)
+    wait_for(lambda: take_raw(forces), 'commands')
+    bridge.change(Transition.TRANSITION_DEACTIVATE)
+    last = None
+    while (raw := take_raw(forces)) is not None:
+        last = raw
+    assert last is None or not any(WrenchStampedCodec().decode(last).values)
+    bridge.change(Transition.TRANSITION_ACTIVATE)
+    raw = wait_for(lambda: take_raw(forces), 'commands of a bridge that works again')
+    assert not any(WrenchStampedCodec().decode(raw).values)

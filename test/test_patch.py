@@ -1,0 +1,65 @@
+"""What is asked around one place of a large tissue is answered by the nodes around it."""
+
+import numpy as np
+import pytest
+from meshes import box
+
+from tissue_sim import compliance, stability
+from tissue_sim.compliance import PointCompliance, solve_static
+from tissue_sim.elasticity import ElasticModel
+from tissue_sim.material import Material
+from tissue_sim.mesh import TetMesh, TopologyDelta
+from tissue_sim.stability import FrequencyBound
+
+CELLS, SIZE = (18, 18, 9), 0.004
+
+
+def large() -> tuple[ElasticModel, np.ndarray]:
+    nodes, tets = box(CELLS, SIZE)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    assert mesh.node_count > 1.5 * max(compliance.PATCH, stability.PATCH)
+    model = ElasticModel(mesh, Material(5000.0, 0.45, 1060.0), 'linear_smoothed')
+    return model, np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / model.mass), 3)
+
+
+def test_the_compliance_of_a_patch_is_just_below_that_of_the_tissue() -> None:
+    model, inverse = large()
+    rest = model.mesh.rest
+    up = np.array([[0.0, 0.0, 1.0]])
+    middle = rest.max(axis=0) * [0.5, 0.5, 1.0]
+    point = PointCompliance()
+    for shift in (0.0, 0.004):  # a tool that goes on starts from what it knew
+        nodes = np.argsort(np.linalg.norm(rest - middle - [shift, 0, 0], axis=1))[:3]
+        load = np.zeros_like(rest)
+        load[nodes] = up / 3
+        exact = float((solve_static(model, inverse > 0, load)[nodes] @ up[0]).mean())
+        for _ in range(12):
+            found = point.estimate(model, inverse > 0, nodes, np.full(3, 1 / 3), up)[0, 0]
+        assert 0.95 * exact < found <= exact
+
+
+def test_a_sliver_in_a_large_tissue_raises_the_bound_as_a_search_of_the_whole_does() -> None:
+    model, inverse = large()
+    mesh = model.mesh
+    bound = FrequencyBound(model, inverse)
+    before = bound.omega
+    middle = int(np.argmin(np.linalg.norm(mesh.rest[mesh.tetrahedra].mean(axis=1) - 0.03, axis=1)))
+    parents = mesh.tetrahedra[middle].astype(np.int64)
+    children = np.tile(parents, (4, 1))
+    children[range(4), range(4)] = mesh.node_count
+    delta = TopologyDelta(
+        node_parents=parents[None],
+        node_weights=np.array([[0.01, 0.33, 0.33, 0.33]]),
+        removed_tetrahedra=np.array([middle]),
+        tetrahedra=children,
+        outer_faces=np.zeros(4, np.uint8),
+    )
+    touched = mesh.apply(delta)
+    model.update(touched)
+    inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / model.mass), 3)
+    bound.update(touched.nodes, inverse)
+    for _ in range(20):
+        bound.refine()
+    whole = FrequencyBound(model, inverse).omega
+    assert whole > 1.2 * before
+    assert bound.omega == pytest.approx(whole, rel=0.02)

@@ -1,0 +1,244 @@
+"""What cannot be used is refused at the edge with a reason, and refusals stay bounded."""
+
+import math
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from meshes import irregular_box
+
+from haptic_bridge.wire import (
+    LONGEST_FRAME,
+    ContactCodec,
+    ForceSampleCodec,
+    PoseStampedCodec,
+    StampedCodec,
+    WrenchStampedCodec,
+)
+from tissue_sim.errors import MeshError
+from tissue_sim.mesh import TetMesh
+from tissue_sim.refusals import (
+    LONGEST_SAID,
+    MOST_REASONS,
+    OTHERS,
+    MessageError,
+    Refusals,
+    require_frame,
+)
+from tissue_sim.replica import MeshReplica, state_hash
+from tissue_sim.tool_contact import tool_contact
+
+NODES = 20
+BAD = (math.nan, math.inf, -math.inf, 1e300, -1e300)
+
+
+def contact(**changed: Any) -> SimpleNamespace:
+    """A contact as the bridge sends it, with some fields of another value."""
+    header = SimpleNamespace(frame_id='tissue', stamp=SimpleNamespace(sec=1, nanosec=2))
+    fields: dict[str, Any] = {
+        'header': header,
+        'sequence': 5,
+        'state': 1,
+        'topology': 0,
+        'nodes': np.array([1, 2, 3] + [0] * 6, np.uint32),
+        'weights': np.array([0.5, 0.25, 0.25] + [0.0] * 6),
+        'normal': np.array([0.0, 0.0, 1.0]),
+        'coupling_stiffness': 200.0,
+        'proxy_radius': 0.004,
+    }
+    for name in ('device', 'proxy', 'point', 'blade_root', 'blade_tip'):
+        fields[name] = np.zeros(3)
+    return SimpleNamespace(**fields | changed)
+
+
+def mesh(**changed: Any) -> SimpleNamespace:
+    """A mesh as `tissue_sim` sends it, with some fields of another value."""
+    tissue = TetMesh(*irregular_box((1, 1, 1), 0.01, 3))
+    still = np.zeros_like(tissue.rest)
+    fields: dict[str, Any] = {
+        'rest': tissue.rest.ravel().copy(),
+        'displacement': still.ravel(),
+        'fixed': tissue.fixed.copy(),
+        'tetrahedra': tissue.tetrahedra.ravel().copy(),
+        'triangles': tissue.triangles.ravel().copy(),
+        'triangle_kind': tissue.triangle_kind.copy(),
+        'revision': 3,
+        'topology': 0,
+        'step': 0,
+        'state_hash': state_hash(tissue.rest, still, tissue.tetrahedra),
+    }
+    return SimpleNamespace(**fields | changed)
+
+
+def spoilt(values: np.ndarray, value: float) -> np.ndarray:
+    out = values.copy()
+    out[-1] = value
+    return out
+
+
+@pytest.mark.parametrize('bad', BAD)
+@pytest.mark.parametrize(
+    'name', ['weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip']
+)
+def test_a_contact_with_a_number_that_cannot_be_is_refused_by_name(name: str, bad: float) -> None:
+    tool_contact(contact(), NODES)
+    with pytest.raises(MessageError, match=name) as refused:
+        tool_contact(contact(**{name: spoilt(getattr(contact(), name), bad)}), NODES)
+    assert refused.value.reason == 'not finite or too far'
+
+
+@pytest.mark.parametrize(
+    ('changed', 'reason'),
+    [
+        ({'state': 3}, 'no such state'),
+        ({'nodes': np.full(9, 2**32 - 1, np.uint32)}, 'index out of range'),
+        ({'weights': np.full(9, 0.5)}, 'weights that are none'),
+        ({'normal': np.array([0.0, 0.0, 1.1])}, 'normal that is none'),
+        ({'coupling_stiffness': math.nan}, 'stiffness out of range'),
+        ({'coupling_stiffness': -1.0}, 'stiffness out of range'),
+        ({'coupling_stiffness': 0.0}, 'stiffness out of range'),
+        ({'coupling_stiffness': 5e-324, 'state': 0}, 'stiffness out of range'),
+        ({'coupling_stiffness': 2e5}, 'stiffness out of range'),
+        ({'proxy_radius': math.inf}, 'radius out of range'),
+        (
+            {'header': SimpleNamespace(frame_id='arm', stamp=contact().header.stamp)},
+            'wrong frame',
+        ),
+        (
+            {
+                'header': SimpleNamespace(
+                    frame_id='tissue', stamp=SimpleNamespace(sec=0, nanosec=2**32 - 1)
+                )
+            },
+            'no such time',
+        ),
+    ],
+)
+def test_each_other_field_of_a_contact_is_refused_with_its_reason(changed, reason: str) -> None:
+    with pytest.raises(MessageError) as refused:
+        tool_contact(contact(**changed), NODES)
+    assert refused.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    ('changed', 'reason'),
+    [
+        *(({'rest': spoilt(mesh().rest, bad)}, 'not finite or too far') for bad in BAD),
+        *(({'displacement': spoilt(mesh().rest, bad)}, 'not finite or too far') for bad in BAD),
+        ({'tetrahedra': spoilt(mesh().tetrahedra, 99)}, 'index out of range'),
+        ({'triangles': spoilt(mesh().triangles, 99)}, 'index out of range'),
+        ({'tetrahedra': mesh().tetrahedra[:-1]}, 'arrays that do not fit'),
+        ({'fixed': mesh().fixed[:-1]}, 'arrays that do not fit'),
+        ({'rest': np.zeros(0)}, 'index out of range'),
+        ({'rest': mesh().rest + 1e-6}, 'not what its hash says'),
+        ({'tetrahedra': np.roll(mesh().tetrahedra, 4)}, 'not what its hash says'),
+    ],
+)
+def test_a_mesh_that_cannot_be_is_refused_and_the_one_before_stays(changed, reason: str) -> None:
+    replica = MeshReplica()
+    replica.load(mesh())
+    before = replica.hash()
+    with pytest.raises(MessageError) as refused:
+        replica.load(mesh(revision=9, **changed))
+    assert refused.value.reason == reason
+    assert (replica.revision, replica.hash()) == (3, before)
+
+
+@pytest.mark.parametrize('bad', BAD)
+@pytest.mark.parametrize('field', ['displacement', 'rest'])
+def test_a_delta_with_a_number_that_cannot_be_changes_nothing(field: str, bad: float) -> None:
+    replica = MeshReplica()
+    replica.load(mesh())
+    before, empty = replica.hash(), np.zeros(0)
+    delta = SimpleNamespace(
+        base_revision=3,
+        revision=4,
+        topology=0,
+        step=1,
+        node_count=len(replica.rest),
+        tetrahedron_count=len(replica.tetrahedra),
+        triangle_count=len(replica.triangles),
+        **dict.fromkeys(('tetrahedra_changed', 'tetrahedra', 'triangles_changed'), empty),
+        **dict.fromkeys(('triangles', 'triangle_kind'), empty),
+        **{'displaced': np.array([1]), 'displacement': np.zeros(3)},
+        **{'rest_changed': np.array([1]), 'rest': np.zeros(3), 'fixed': np.zeros(1)},
+    )
+    setattr(delta, field, np.array([0.0, bad, 0.0]))
+    with pytest.raises(MessageError, match=field):
+        replica.apply(delta)
+    assert (replica.revision, replica.hash()) == (3, before)
+
+
+@pytest.mark.parametrize('codec', [PoseStampedCodec, WrenchStampedCodec, ContactCodec])
+@pytest.mark.parametrize('bad', BAD)
+def test_a_sample_with_a_quantity_that_cannot_be_is_not_believed(
+    codec: type[StampedCodec], bad: float
+) -> None:
+    for name, code, _ in codec.layout:
+        values: list[Any] = [0] * codec.fields[codec.layout[-1][0]].stop
+        if codec is PoseStampedCodec:
+            values[-1] = 1.0
+        codec().believed(codec().encode(5, values))
+        if code == 'd':
+            values[codec.fields[name].start] = bad
+            with pytest.raises(MessageError, match=name):
+                codec().believed(codec().encode(5, values))
+
+
+def test_an_orientation_or_a_state_that_does_not_exist_is_not_believed() -> None:
+    with pytest.raises(MessageError, match='unit quaternion'):
+        PoseStampedCodec().believed(PoseStampedCodec().encode(5, [0.0] * 7))
+    for codec in (ContactCodec, ForceSampleCodec):
+        values = [0] * codec.fields[codec.layout[-1][0]].stop
+        values[codec.fields['state'].start] = 3
+        with pytest.raises(MessageError, match='no such state'):
+            codec().believed(codec().encode(5, values))
+
+
+def test_a_surface_that_is_not_that_of_its_tetrahedra_makes_no_mesh() -> None:
+    replica, sent = MeshReplica(), mesh()
+    replica.load(mesh(triangles=sent.triangles[3:], triangle_kind=sent.triangle_kind[1:]))
+    with pytest.raises(MeshError, match='surface triangles were sent'):
+        replica.mesh()
+
+
+def test_frames_without_end_are_refused_and_new_ones_take_no_memory() -> None:
+    reader = PoseStampedCodec()
+    values = (*[0.0] * 6, 1.0)
+    for number in range(1000):
+        assert reader.decode(PoseStampedCodec(f'{number}').encode(5, values)).frame_id
+    assert len(reader._frames) < 100
+    reader.decode(PoseStampedCodec('x' * LONGEST_FRAME).encode(5, values))
+    with pytest.raises(MessageError, match='at most') as refused:
+        reader.decode(PoseStampedCodec('x' * (LONGEST_FRAME + 1)).encode(5, values))
+    assert refused.value.reason == 'frame_id too long'
+    with pytest.raises(MessageError, match='wrong frame'):
+        require_frame('tool/contact', 'x' * 100_000)
+
+
+def test_refusals_are_counted_by_topic_and_reason() -> None:
+    refusals = Refusals()
+    for number in range(5):
+        refusals.add('tool/contact', MessageError('no such state', f'state {number}'))
+    refusals.add('cutting/cut', KeyError('x'))
+    assert refusals.values() == {
+        'refused tool/contact: no such state': 5,
+        'refused cutting/cut: KeyError': 1,
+    }
+    assert refusals.total == 6
+
+
+def test_counts_and_lines_are_bounded_whatever_comes() -> None:
+    refusals = Refusals()
+    for number in range(1000):
+        text = f'{number} \n\x1b[31m{"x" * 100_000}'
+        refusals.add(f'topic{number}', MessageError('too large', text))
+    values = refusals.values()
+    assert len(values) == MOST_REASONS + 1
+    assert values[f'refused {OTHERS}'] == 1000 - MOST_REASONS
+    said = refusals.news()
+    assert re.fullmatch(r'[ -~]+', said)
+    assert len(said) < LONGEST_SAID + 400
+    assert refusals.news() == ''
