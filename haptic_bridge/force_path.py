@@ -180,6 +180,7 @@ class ForcePath:
         state: State,
         pose: Sample | None = None,
         sample: Sample | None = None,
+        sample_ns: int | None = None,
         surface: Surface | None = None,
     ) -> Tick:
         """One period.
@@ -189,12 +190,15 @@ class ForcePath:
             state: operating state; force only when ENABLED, zero at once when FAULT.
             pose: `measured_cp` where one has arrived since the last tick.
             sample: `ForceSample` where one has arrived since the last tick.
+            sample_ns: from when its age counts [ns] where it waited in a queue; None: `now_ns`.
             surface: the newest surface of the tissue; None before the first.
         """
         elapsed = min(max((now_ns - self._last_ns) * _SECOND, 1e-4), _LONGEST_STEP)
         self._last_ns = now_ns
         enabled = state is State.ENABLED
-        fault = self._take_pose(now_ns, pose, enabled) or self._take_sample(now_ns, sample)
+        fault = self._take_pose(now_ns, pose, enabled) or self._take_sample(
+            now_ns, sample, now_ns if sample_ns is None else sample_ns
+        )
         fault = fault or self.cause(now_ns)
         enabled, fault = enabled and not fault, fault if enabled else ''
         if enabled and not self._was_enabled:
@@ -242,7 +246,7 @@ class ForcePath:
         self._pose_stamp, self._pose_ns = pose.stamp_ns, now_ns
         return ''
 
-    def _take_sample(self, now_ns: int, sample: Sample | None) -> str:
+    def _take_sample(self, now_ns: int, sample: Sample | None, sample_ns: int) -> str:
         if sample is None:
             return ''
         said = TissueSample.read(sample)
@@ -257,7 +261,7 @@ class ForcePath:
         if not fresh:
             extrapolation.clear(self._history)
         self._step, self._sample_revision = said.step, said.revision
-        self._sample_ns = now_ns - _UNNOTICED_NS
+        self._sample_ns = sample_ns - _UNNOTICED_NS
         self._sample_state = said.state
         self._s['resistance'] = said.resistance
         answered = self._began <= said.sequence <= self._sequence and self._contact == TOUCHING

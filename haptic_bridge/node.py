@@ -55,12 +55,13 @@ class SimulationFollower:
 
     Attributes:
         surface: the newest whole one; None before the first.
-        samples: forces that the fast loop has not taken yet.
+        samples: forces that the fast loop has not taken yet, each with the time [ns] at which it
+            would have come if it had not waited anywhere: so old is it, however late it is read.
     """
 
     def __init__(self, node: ManagedNode, on_error: Callable[[str], None]) -> None:
         self.surface: Surface | None = None
-        self.samples: deque[Sample] = deque(maxlen=4)
+        self.samples: deque[tuple[Sample, int]] = deque(maxlen=4)
         self._on_error = on_error
         self._refusals = node.refusals
         self._follower = MeshFollower(node, node.refusals)
@@ -108,11 +109,12 @@ class SimulationFollower:
             return
         sample = self._codec.decode(taken[0])
         require_frame(ros.FORCE, sample.frame_id)
-        problem = self._watch.see(taken[1], sample.stamp_ns, time.monotonic_ns())
+        now = time.monotonic_ns()
+        problem = self._watch.see(taken[1], sample.stamp_ns, now)
         if self._watch.late:
             self._late += 1
         else:
-            self.samples.append(sample)
+            self.samples.append((sample, now - self._watch.delay))
         if problem:
             self._on_error(problem)
 
@@ -229,11 +231,13 @@ class HapticBridge(ManagedNode):
         try:
             pose = self._take_pose(now)
             samples = self._follower.samples
+            sample, sample_ns = samples.popleft() if samples else (None, now)
             tick = self._path.tick(
                 now,
                 state=self._machine.state,
                 pose=pose,
-                sample=samples.popleft() if samples else None,
+                sample=sample,
+                sample_ns=sample_ns,
                 surface=self._follower.surface,
             )
             self._send(tick.wrench, now)

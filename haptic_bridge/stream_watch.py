@@ -29,10 +29,12 @@ class StreamWatch:
 
     Attributes:
         late: the last message came more than `CLOCK_JUMP` later than is usual; use it for nothing.
+        delay: by which the last message came later than is usual [ns]: it is older by that.
     """
 
     def __init__(self, topic: str, *, queues: bool = False) -> None:
         self.late = False
+        self.delay = 0
         self._topic = topic
         self._queues = queues
         self._late_since: int | None = None
@@ -84,11 +86,12 @@ class StreamWatch:
         if stamp_ns == 0:
             return ''
         offset = stamp_ns - now_ns
-        jump = 0.0 if self._offset is None else (offset - self._offset) / _NANOSECONDS
+        usual = offset if self._offset is None else self._offset
+        self.delay = max(0, usual - offset)
+        jump = (offset - usual) / _NANOSECONDS
         if self._queues and self._falls_behind(jump, now_ns):
             return ''
-        usual = self._offset
-        if self._queues and usual is not None and -CLOCK_JUMP <= jump < 0:
+        if self._queues and -CLOCK_JUMP <= jump < 0:
             self._offset = usual + round(FORGETTING * (offset - usual))
         else:
             self._offset = offset

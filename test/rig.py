@@ -32,6 +32,7 @@ class Rig:
         self.forces, self.ticks = [], []
         self.last_contact = None
         self.spoil = lambda sample: sample
+        self.waited = 0
 
     def run(self, heights):
         """One tick a millisecond with the tool tip at each of the heights [m]."""
@@ -45,7 +46,12 @@ class Rig:
         pose = Sample(stamp or self.now, '', (*position, *orientation)) if self.poses else None
         sample = self._sample() if self.sim and self.ms % FRAME == 0 else None
         out = self.path.tick(
-            self.now, state=self.state, pose=pose, sample=sample, surface=self.surface
+            self.now,
+            state=self.state,
+            pose=pose,
+            sample=sample,
+            sample_ns=self.now - self.waited * MS,
+            surface=self.surface,
         )
         if out.fault:
             self.state = State.FAULT

@@ -32,6 +32,8 @@ here. The profile is one whose slew limit, 0.2 N in a tick, the force that is fe
 PROFILE = DeviceSettings(profile='dvrk_mtm').load_profile()
 HOUR = 3600 * 10**9
 LATE = 50 * 10**6
+WAITED = 300 * 10**6
+"""[ns]"""
 STALE, FADE = 0.1, 0.05
 BACK = 0.5
 """[s] after which a force that was let in again is whole."""
@@ -114,6 +116,9 @@ class FaultyWorld(World):
         force = self.next_force()
         if self.fault in SPOILT:
             force = self.spoilt_force(*SPOILT[self.fault])
+        elif self.fault == 'waited':
+            sample = ForceSampleCodec().decode(force)
+            force = ForceSampleCodec('tissue').encode(sample.stamp_ns - WAITED, sample.values)
         if self.fault == 'two simulations' and self.revision % 2:
             self.updates.publish(delta)
             self.second.publish(force)
@@ -202,7 +207,7 @@ def play(world: FaultyWorld, record: Record) -> None:
         end(fault)
         world.node.destroy_publisher(world.second)
         time.sleep(1.2)  # as long as the bridge remembers it
-    for fault, seconds in (('duplicated', 0.5), ('reordered', 0.5), ('hole', 0.5)):
+    for fault, seconds in (('duplicated', 0.5), ('reordered', 0.5), ('waited', 0.6), ('hole', 0.5)):
         begin(fault)
         time.sleep(seconds)
         end(fault)
@@ -299,6 +304,13 @@ def test_messages_that_come_twice_or_in_the_wrong_order_are_not_felt(record, fau
     assert 'FAULT' not in states(record, fault)
 
 
+def test_forces_that_have_waited_in_a_queue_are_not_felt_as_if_they_were_new(record):
+    forces = record.forces('waited', STALE + FADE + SCHEDULING, before='waited over')
+    assert len(forces) > 200
+    assert not forces.any()
+    assert 'FAULT' not in states(record, 'waited')
+
+
 def test_refused_messages_are_counted(record):
     assert refused(record.statuses[-1]) > 400
 
@@ -338,8 +350,8 @@ def test_on_a_full_cpu_no_force_is_larger_than_the_tissues_and_how_late_it_is_is
     assert len(forces) > 100
     assert np.linalg.norm(forces, axis=1).max() < 1.02 * FELT
     assert forces[:, 2].min() >= 0
-    told = [s['lateness_max'] for s in record.statuses[int(record.marks['told before']) :]]
-    assert max(map(float, told)) > 0
+    statuses = record.statuses[int(record.marks['told before']) :]
+    assert max(float(s.get('lateness_max', 0.0)) for s in statuses) > 0
 
 
 def test_force_comes_back_after_every_fault_without_a_restart(record):

@@ -196,6 +196,21 @@ def test_messages_that_wait_in_a_network_are_late_and_its_clock_is_believed():
     assert [delay > 0.52 for delay in delays] == late
 
 
+def test_messages_are_older_by_what_they_waited_more_than_is_usual():
+    watch = StreamWatch('force', queues=True)
+    frame = SECOND // 30
+    delays = [0.02] * 30 + [0.4 - 0.03 * k for k in range(12)] + [0.02] * 30
+    waited = []
+    for number, delay in enumerate(delays):
+        watch.see(number + 1, number * frame, round(number * frame + delay * SECOND))
+        waited.append(watch.delay / SECOND)
+    assert waited == pytest.approx([delay - 0.02 for delay in delays], abs=0.03)
+    longer = [0.12] * 600
+    for number, delay in enumerate(longer, len(delays)):
+        watch.see(number + 1, number * frame, round(number * frame + delay * SECOND))
+    assert watch.delay / SECOND < 1e-3  # a way that has become longer is usual in the end
+
+
 def test_a_clock_that_was_set_back_behind_a_network_is_told_in_the_end():
     watch = StreamWatch('force', queues=True)
     said = []

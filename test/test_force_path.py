@@ -142,6 +142,17 @@ def test_a_simulation_that_returns_is_let_in_softly():
     assert force[-1] == pytest.approx(K * 5e-3)
 
 
+def test_forces_that_waited_in_a_queue_are_as_old_as_that():
+    rig = pressed()
+    rig.waited = 90
+    force = rig.run(np.full(200, RADIUS - 5e-3))[:, 2] / (K * 5e-3)
+    assert force[FRAME - 1 :].min() < 1 and rig.path.stale_trips
+    rig.waited = 150
+    assert not rig.run(np.full(200, RADIUS - 5e-3))[FRAME:].any()
+    rig.waited = 0
+    assert rig.run(np.full(200, RADIUS - 5e-3))[-1, 2] == pytest.approx(K * 5e-3)
+
+
 def test_a_surface_that_lags_behind_the_forces_counts_as_silence():
     rig = pressed()
     rig.mesh = False
