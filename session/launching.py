@@ -41,7 +41,7 @@ PARAMETERS = {
     VIEWER_NODE: ('scene', 'host', 'port'),
 }
 """Of the nodes that have others than `USUAL`."""
-OF_DEVICE = ('measured_cp', 'measured_cv', 'servo_cf', 'button')
+OF_DEVICE = ('measured_cp', 'servo_cf', 'button', 'operating_state', 'state_command')
 """Topics by which bridge, viewer and device know each other."""
 
 

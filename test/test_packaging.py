@@ -224,6 +224,19 @@ def test_launch_file_starts_the_nodes_of_a_session_with_the_same_parameters(
         assert parameters.keys() == given
 
 
+def test_the_bridge_finds_all_of_a_device_in_its_namespace(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (bridge,) = of_kind(launch_description(monkeypatch, 'bridge'), 'Node')
+    remapped = {topic for topic, _ in bridge.kwargs['remappings']}
+    text = ''.join(
+        (ROOT / path).read_text() for path in ('haptic_bridge/node.py', 'haptic_bridge/crtk.py')
+    )
+    named = set(re.findall(r"\{(?:ros\.ARM|name)\}/(\w+)'", text)) - {'state_command'}
+    assert {'measured_cp', 'servo_cf', 'operating_state', 'button'} <= named
+    assert {f'arm/{topic}' for topic in named} <= remapped
+
+
 @pytest.mark.parametrize('name', LAUNCH_FILES)
 def test_every_value_that_a_launch_file_uses_is_an_argument_of_it_with_a_description(
     monkeypatch: pytest.MonkeyPatch, name: str
