@@ -1,4 +1,8 @@
-"""A session computed again, compared with what was recorded, frame by frame and bit for bit."""
+"""A session computed again, compared with what was recorded, frame by frame and bit for bit.
+
+Another processor adds in another order, and so rounds otherwise: what differs by no more than that
+is told, and the comparison goes on.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -20,6 +24,9 @@ from tissue_sim.tool_contact import tool_contact
 
 PoseError = Callable[[Sample, Any], float]
 """Takes a device pose and a contact; how far [m] the tool is from where that pose puts it."""
+ROUNDING = 1e-9
+"""Largest difference, in relation to what was recorded, that counts as rounding. One that matters
+grows past it: the computation goes on from its own state, not from what was recorded."""
 _QUANTITIES = {
     'force': 'N',
     'position': 'm',
@@ -70,9 +77,11 @@ class Comparison:
         seconds: of the session that they are [s].
         forces, meshes, hashes, poses: compared.
         missing: what the bag lacks, in number, by a phrase.
-        difference: the first, None when all that was compared is identical.
+        difference: the first of more than rounding, None where there is none.
         restart: where another process went on, from a state that the bag does not have (velocities,
             what the method of cutting remembered): it ends there. None: nowhere.
+        rounding: the first difference of no more than `ROUNDING`.
+        largest: such difference, in relation to what was recorded.
     """
 
     frames: int = 0
@@ -84,6 +93,13 @@ class Comparison:
     missing: Counter[str] = field(default_factory=Counter)
     difference: Difference | None = None
     restart: Restart | None = None
+    rounding: Difference | None = None
+    largest: float = 0.0
+
+    @property
+    def identical(self) -> bool:
+        """Whether all that was compared is the same bit for bit."""
+        return self.difference is None and self.rounding is None
 
 
 class RecordedMesh:
@@ -175,15 +191,11 @@ def compare(
         comparison.seconds = (record.time - records[0].time) * 1e-9
         try:
             _check_record(record, i + 1, comparison, pose_error)
-            _check_frame(record, computed, recorded, comparison)
+            for rounded in _check_frame(record, computed, recorded, comparison):
+                comparison.largest = max(comparison.largest, rounded.size)
+                comparison.rounding = comparison.rounding or _told(record, comparison, rounded)
         except _Differs as differs:
-            comparison.difference = Difference(
-                record.step,
-                comparison.seconds,
-                str(differs),
-                differs.size,
-                isinstance(differs, _Lacks),
-            )
+            comparison.difference = _told(record, comparison, differs)
             break
         comparison.frames += 1
         progress(i + 1, len(records))
@@ -191,6 +203,11 @@ def compare(
     if recorded.gaps:
         comparison.missing['deltas that do not fit the one before'] = recorded.gaps
     return comparison
+
+
+def _told(record: FrameRecord, comparison: Comparison, differs: _Differs) -> Difference:
+    lacks = isinstance(differs, _Lacks)
+    return Difference(record.step, comparison.seconds, str(differs), differs.size, lacks)
 
 
 def _check_record(
@@ -211,8 +228,8 @@ def _check_record(
 
 def _check_frame(
     record: FrameRecord, computed: Recomputation, recorded: RecordedMesh, comparison: Comparison
-) -> None:
-    """Computes one frame and compares what came of it."""
+) -> Iterator[_Differs]:
+    """Computes one frame and compares what came of it; gives differences by rounding."""
     if what := computed.take_answer(record.answer):
         raise _Differs(what)
     simulation = computed.simulation
@@ -225,7 +242,7 @@ def _check_frame(
         raise _Differs(f'it {("did not diverge", "diverged")[record.diverged]} when recorded')
     if record.force is not None:
         comparison.forces += 1
-        _check_force(frame, simulation.mesh.topology, record.force)
+        yield from _check_force(frame, simulation.mesh.topology, record.force)
     elif not record.diverged:
         comparison.missing['forces of the tissue'] += 1
     recorded.follow(record.step)
@@ -233,10 +250,18 @@ def _check_frame(
         comparison.missing['meshes'] += 1
         return
     comparison.meshes += 1
-    _check_mesh(simulation, recorded.replica)
+    yield from _check_mesh(simulation, recorded.replica)
 
 
-def _check_force(frame: Frame, topology: int, sample: Sample) -> None:
+def _unless_rounded(what: str, size: float) -> _Differs:
+    """A difference of numbers, if it may be one by rounding; raised if it is not."""
+    differs = _Differs(what, size)
+    if not size <= ROUNDING:
+        raise differs
+    return differs
+
+
+def _check_force(frame: Frame, topology: int, sample: Sample) -> Iterator[_Differs]:
     get = ForceSampleCodec.fields
 
     def was(name: str) -> np.ndarray:
@@ -251,10 +276,10 @@ def _check_force(frame: Frame, topology: int, sample: Sample) -> None:
         if off != 0.0:
             size = np.abs(was(name)).max()
             text = f'{name} differs by {off:.3g} {unit}, of {size:.3g} {unit}'
-            raise _Differs(text, off / max(size, 1e-300))
+            yield _unless_rounded(text, off / max(size, 1e-300))
 
 
-def _check_mesh(simulation: TissueSimulation, replica: MeshReplica) -> None:
+def _check_mesh(simulation: TissueSimulation, replica: MeshReplica) -> Iterator[_Differs]:
     mesh, u = simulation.mesh, simulation.displacement
     if state_hash(mesh.rest, u, mesh.tetrahedra) == replica.hash():
         return
@@ -264,4 +289,5 @@ def _check_mesh(simulation: TissueSimulation, replica: MeshReplica) -> None:
         raise _Differs(f'the tetrahedra are not those recorded: {counts}')
     off = max(np.abs(mesh.rest - replica.rest).max(), np.abs(u - replica.displacement).max())
     size = np.ptp(replica.rest, axis=0).max()
-    raise _Differs(f'the mesh has another hash: a node is off by {off:.3g} m', off / size)
+    text = f'the mesh has another hash: a node is off by {off:.3g} m'
+    yield _unless_rounded(text, off / size)

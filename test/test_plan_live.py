@@ -228,7 +228,7 @@ def test_a_session_that_plans_is_computed_again_and_reported_by_what_it_took(
     restored = load_scene(str(restore_scene(bag, tmp_path)))
     assert (restored.tissue.method, restored.tissue.model) == ('given', 'linear_smoothed')
     result = compare(bag, recomputation(restored), pose_check(restored))
-    assert result.difference is None and not result.missing
+    assert result.identical and not result.missing
     assert result.frames > 50
     write_report(session.bag, tmp_path / 'report.html')
     taken = f'linear_smoothed by {restored.tissue.integrator}'

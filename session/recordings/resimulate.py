@@ -96,7 +96,7 @@ def _verify(bag: Bag, scene: Scene, *, as_json: bool) -> Status:
         )
         took = time.monotonic() - began
     if as_json:
-        told = asdict(result) | {'identical': result.difference is None, 'computed_in': took}
+        told = asdict(result) | {'identical': result.identical, 'computed_in': took}
         if result.difference and math.isinf(result.difference.size):
             told['difference']['size'] = None
         print(json.dumps(told, indent=2))
@@ -126,6 +126,13 @@ def verdict(result: Comparison, took: float) -> list[str]:
         )
     if result.difference is None:
         whole = 'identical'
+        if (rounding := result.rounding) is not None:
+            whole += ' but for rounding'
+            lines.append(
+                f'rounded otherwise from frame {rounding.step} ({rounding.seconds:.2f} s) on: '
+                f'{escape(rounding.what)}; at most {result.largest:.1g} of what was recorded, as '
+                'other processors and libraries do'
+            )
         if result.restart is not None:
             whole += f' up to the restart at {result.restart.seconds:.2f} s'
         return [whole + (', as far as the bag can say' if result.missing else ''), *lines]
