@@ -8,6 +8,10 @@ from pathlib import Path
 
 from session.errors import SessionError
 
+TESTS, ALONE = 'tests', 'tests one at a time'
+NO_TESTS = 5
+"""Exit status of pytest where it has found none."""
+
 
 @dataclass(frozen=True)
 class Check:
@@ -35,14 +39,27 @@ def require_checkout(folder: Path) -> None:
         )
 
 
-def all_checks(pytest_arguments: Sequence[str]) -> list[Check]:
-    """Every check, in the order in which it is run; mypy's folders stand in pyproject.toml."""
+def all_checks(pytest_arguments: Sequence[str], temporary: Path) -> list[Check]:
+    """Every check, in the order in which it is run; mypy's folders stand in pyproject.toml.
+
+    Args:
+        pytest_arguments: for both parts of the tests: those that may run beside others, on every
+            processor, and those that want the machine for themselves.
+        temporary: folder for the files of both: the last tests look at what all have made.
+    """
     python = (sys.executable, '-m')
+    tests = (*python, 'pytest', *pytest_arguments)
     return [
         Check('ruff check', (*python, 'ruff', 'check', '.')),
         Check('ruff format', (*python, 'ruff', 'format', '--check', '.')),
         Check('mypy', (*python, 'mypy')),
-        Check('pytest', (*python, 'pytest', *pytest_arguments)),
+        *(
+            Check(name, (*tests, f'--part={part}', f'--basetemp={temporary / part}', *more))
+            for name, part, more in (
+                (TESTS, 'beside', ('--numprocesses=auto', '--dist=loadfile')),
+                (ALONE, 'alone', ()),
+            )
+        ),
     ]
 
 
@@ -67,7 +84,13 @@ def run_checks(
 
 
 def verdict(results: dict[str, int]) -> tuple[int, str]:
-    """Exit status of the first check that failed, 0 if none did, and a sentence that names all."""
+    """Exit status of the first check that failed, 0 if none did, and a sentence that names all.
+
+    Arguments may choose tests of one part only; of none is a failure.
+    """
+    empty = [name for name in (TESTS, ALONE) if results.get(name) == NO_TESTS]
+    if len(empty) == 1:
+        results = {name: status for name, status in results.items() if name not in empty}
     failed = {name: status for name, status in results.items() if status}
     if not failed:
         return 0, f'all passed: {", ".join(results)}'

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -107,9 +108,9 @@ def test(context: typer.Context) -> None:
     root = Path(__file__).resolve().parents[1]
     require_checkout(root)
     console = Console(stderr=True)
-    results = run_checks(
-        all_checks(context.args), root, lambda name: console.rule(name, align='left')
-    )
+    with tempfile.TemporaryDirectory(prefix='trainer-test-', ignore_cleanup_errors=True) as folder:
+        checks = all_checks(context.args, Path(folder))
+        results = run_checks(checks, root, lambda name: console.rule(name, align='left'))
     status, sentence = verdict(results)
     console.print(sentence, style='bold red' if status else 'bold green', highlight=False)
     raise typer.Exit(status)

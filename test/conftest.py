@@ -1,5 +1,6 @@
 """Tests against the clock (marker `real_time`) are repeated where the machine failed, not the code;
-and a fixture that more than one file uses.
+tests that want the machine for themselves are told from the others; and a fixture that more than
+one file uses.
 
 Such a test is run again, at most twice, if it failed while a processor demonstrably stood still
 (stand_still.py). A fault of the code fails each time.
@@ -32,6 +33,16 @@ REPEATED = pytest.StashKey[list[str]]()
 BUILT = pytest.StashKey[Path]()
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds `--part`: `trainer test` runs the two parts one after the other."""
+    parser.addoption(
+        '--part',
+        choices=('beside', 'alone'),
+        help='only tests that may run beside others, or only those that must not: '
+        'against the clock, over the network, with processes of their own',
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Starts to watch the processors, and sees to it that an interrupt is one.
 
@@ -47,9 +58,18 @@ def pytest_configure(config: pytest.Config) -> None:
         config.stash[WATCH] = subprocess.Popen(command, stdout=file)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts the tests that look at what all others have made behind them."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Chooses the part; puts the tests that look at what all others have made behind them."""
     items.sort(key=lambda item: item.path.name == 'test_every_bag.py')
+    if part := config.getoption('part'):
+        others = [item for item in items if is_alone(item) != (part == 'alone')]
+        items[:] = [item for item in items if is_alone(item) == (part == 'alone')]
+        config.hook.pytest_deselected(items=others)
+
+
+def is_alone(item: pytest.Item) -> bool:
+    """Whether a test wants the machine for itself."""
+    return any(item.get_closest_marker(name) for name in ('alone', 'real_time'))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

@@ -19,6 +19,8 @@ from tissue_sim.elasticity import ElasticModel
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 
+pytestmark = pytest.mark.alone
+
 
 @pytest.fixture(scope='module', autouse=True)
 def _short() -> None:

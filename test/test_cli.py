@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from session import cli, commands_own
-from session.checks import Check, all_checks, run_checks, verdict
+from session.checks import ALONE, NO_TESTS, TESTS, Check, all_checks, run_checks, verdict
 from session.scene import SCENES, find_scene, load_scene
 from session.status import Status
 
@@ -209,12 +209,12 @@ def test_test_command_runs_every_check_and_has_the_status_of_the_first_that_fail
     checks = [
         Check('lint', python('pass')),
         Check('types', python('raise SystemExit(7)')),
-        Check('tests', python('raise SystemExit(5)')),
+        Check('links', python('raise SystemExit(5)')),
     ]
     announced: list[str] = []
     results = run_checks(checks, tmp_path, announced.append)
-    assert announced == ['lint', 'types', 'tests']
-    assert verdict(results) == (7, 'failed: types, tests')
+    assert announced == ['lint', 'types', 'links']
+    assert verdict(results) == (7, 'failed: types, links')
     assert verdict({'lint': 0, 'tests': 0}) == (0, 'all passed: lint, tests')
 
 
@@ -227,9 +227,19 @@ def test_test_command_of_an_installation_says_that_the_tests_are_in_the_source(
 
 
 def test_extra_arguments_of_the_test_command_reach_pytest() -> None:
-    checks = all_checks(['-k', 'patch', '--maxfail=1'])
-    assert [check.name for check in checks] == ['ruff check', 'ruff format', 'mypy', 'pytest']
-    assert checks[-1].argv[1:] == ('-m', 'pytest', '-k', 'patch', '--maxfail=1')
+    *others, beside, alone = all_checks(['-k', 'patch', '--maxfail=1'], Path('/tmp/x'))
+    assert [check.name for check in others] == ['ruff check', 'ruff format', 'mypy']
+    for tests, part in ((beside, 'beside'), (alone, 'alone')):
+        assert tests.argv[1:6] == ('-m', 'pytest', '-k', 'patch', '--maxfail=1')
+        assert {f'--part={part}', f'--basetemp=/tmp/x/{part}'} < set(tests.argv)
+    assert '--numprocesses=auto' in beside.argv and '--numprocesses=auto' not in alone.argv
+
+
+def test_arguments_may_choose_tests_of_one_part_but_not_of_none() -> None:
+    assert verdict({'lint': 0, TESTS: NO_TESTS, ALONE: 0})[0] == 0
+    assert verdict({'lint': 0, TESTS: 0, ALONE: NO_TESTS})[0] == 0
+    assert verdict({'lint': 0, TESTS: NO_TESTS, ALONE: 1}) == (1, f'failed: {ALONE}')
+    assert verdict({'lint': 0, TESTS: NO_TESTS, ALONE: NO_TESTS})[0] == NO_TESTS
 
 
 def test_nodes_get_their_parameters_quoted_and_one_environment(

@@ -21,6 +21,8 @@ from session import cli
 from session.domain import reserved_domain
 from session.graph import node_environment
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).resolve().parents[1]
 SESSION = ROOT / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 PROGRAMS = (

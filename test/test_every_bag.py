@@ -1,27 +1,43 @@
 """Two independent readers read every bag that the tests of this run have made; it runs last.
 
-Bags are found where the tests make them, in pytest's folder of temporary files. One that was cut
-off, as a test wanted it, is repaired first, in a copy.
+Bags are found where the tests make them, in pytest's folder of temporary files: `trainer test` has
+one for each of the two parts. One that was cut off, as a test wanted it, is repaired first, in a
+copy.
 """
 
 import shutil
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
-from independent_readers import ROOT, Topics, by_us, check_by_mcap_core, check_by_rosbags
+from independent_readers import (
+    ROOT,
+    Topics,
+    by_us,
+    check_by_mcap_core,
+    check_by_rosbags,
+    mcap_core,
+)
 
 from bags.reader import open_bag
 from bags.repair import repair_bag
+
+pytestmark = pytest.mark.alone
 
 MAGIC = b'\x89MCAP0\r\n'
 
 
 @pytest.fixture(scope='module')
-def every_bag(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Topics]:
+def every_bag(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[Path, Topics]:
     """What our reader finds in the samples and in all bags made so far, whole or made whole."""
     found = {path.parent: path for path in ROOT.glob('bags/samples/*/*/*.mcap')}
     known = {path.read_bytes() for path in found.values()}
     made, mended = tmp_path_factory.getbasetemp(), tmp_path_factory.mktemp('mended')
+    if request.config.getoption('part'):
+        made = made.parent
     for path in sorted(made.rglob('*.mcap')):
         data = path.read_bytes()
         if data in known or not data.startswith(MAGIC):
@@ -35,15 +51,24 @@ def every_bag(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Topics]:
             assert not repair_bag(folder).whole, path
         assert open_bag(folder).complete, path
         found[folder] = path
-    return {folder: by_us(folder) for folder in found}
+    with processes() as several:
+        return dict(zip(found, several.map(by_us, found), strict=True))
+
+
+def processes() -> ProcessPoolExecutor:
+    """One for each processor, without the threads that this one has by now."""
+    return ProcessPoolExecutor(mp_context=get_context('spawn'))
 
 
 def test_rosbags_reads_every_bag_as_we_do(every_bag: dict[Path, Topics]) -> None:
-    for folder, topics in every_bag.items():
-        check_by_rosbags(folder, topics)
+    with processes() as several:
+        list(several.map(check_by_rosbags, every_bag, every_bag.values()))
 
 
 def test_mcap_core_reads_every_bag_as_we_do_by_index_and_by_stream(
     every_bag: dict[Path, Topics],
 ) -> None:
-    check_by_mcap_core(every_bag)
+    mcap_core()
+    shares = [dict(list(every_bag.items())[i::4]) for i in range(4)]
+    with processes() as several:
+        list(several.map(check_by_mcap_core, filter(None, shares)))

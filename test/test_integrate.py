@@ -20,6 +20,8 @@ from session.graph import BRIDGE_NODE, CUTTING_NODE, TISSUE_NODE, node_command, 
 from session.processes import Supervisor
 from tissue_sim import ros
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / 'docs' / 'integrate.md').read_text(encoding='utf-8')
 PRESS, LARGEST = re.findall(r'```python\n(.*?)```', PAGE, re.DOTALL)

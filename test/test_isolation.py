@@ -16,7 +16,10 @@ from session.graph import MODULES, node_environment
 from session.network import Network, network_environment
 
 pytest.importorskip('rclpy')
-pytestmark = pytest.mark.skipif(bool(missing_rights()), reason=missing_rights())
+pytestmark = [
+    pytest.mark.alone,
+    pytest.mark.skipif(bool(missing_rights()), reason=missing_rights()),
+]
 
 SECONDS = 2.5
 STRANGER = """

@@ -21,6 +21,8 @@ from typer.main import get_command
 
 from session.cli import app
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

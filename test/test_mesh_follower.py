@@ -22,6 +22,8 @@ from tissue_sim.replica import MeshReplica
 from tissue_sim.ros import stamp
 from tissue_sim.stamps import REVISIONS, nanoseconds, newer
 
+pytestmark = pytest.mark.alone
+
 SECOND = 1_000_000_000
 END_OF_32_BITS = 2**31 * SECOND
 

@@ -8,6 +8,8 @@ from rig import FRAME, PROFILE, RADIUS, K, Rig
 
 from haptic_bridge.surface import Surface
 
+pytestmark = pytest.mark.alone
+
 POINTS, WIDTH, DEPTH = 101, 0.1, 4e-3
 BEFORE, CHANGES = 10, 8
 """Frames before the first change, and with one."""

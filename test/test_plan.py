@@ -32,6 +32,8 @@ from tissue_sim.press import places, settlement
 from tissue_sim.probe import Probing, Strains
 from tissue_sim.refine import refined
 
+pytestmark = pytest.mark.alone
+
 GEL = Material(5000.0, 0.4, 1000.0, 10.0, 2e-4)
 
 

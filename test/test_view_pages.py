@@ -22,6 +22,8 @@ from viewer.panel import METHODS
 from viewer.stage import TissueView
 from viewer.surfaces import lips
 
+pytestmark = pytest.mark.alone
+
 SIDE = 100
 """Squares along an edge of a sheet of 20,000 triangles."""
 FRAMES = 240

@@ -27,6 +27,8 @@ from viewer.page import addresses
 from viewer.replay_page import ReplayPage
 from viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
 
+pytestmark = pytest.mark.alone
+
 CUT = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 NOTES = Console(quiet=True)
 
