@@ -75,6 +75,7 @@ class Nowhere:
 
 
 PACKAGED = Nowhere('needs ROS from packages, which cannot be installed beside the wheels')
+PEERS = Nowhere('the peers are no dependency; test_peers.py tries what needs none of them')
 HERE = (
     'picture BAG -o liver.png',
     'export BAG mesh.vtu',
@@ -151,6 +152,9 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     'pip install --dry-run --report - -r requirements.txt -r requirements-ros.txt '
     '-r requirements-mesh.txt -r requirements-test.txt': Nowhere('renews the lock, by hand'),
     'rviz2 -d config/rviz/trainer.rviz': PACKAGED,
+    'python3 -m venv peers': PEERS,
+    'peers/bin/pip install -r requirements.txt -r bench/requirements-peers.txt': PEERS,
+    'peers/bin/python -m bench.peers': PEERS,
     'ssh -L 8080:127.0.0.1:8080 trainer': Nowhere('needs a second machine'),
 }
 

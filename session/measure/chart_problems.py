@@ -134,11 +134,14 @@ class Cantilever:
 
     Args:
         poissons_ratio: of its material [-].
+
+    Attributes:
+        force: the load [N].
     """
 
     reference_name = 'scikit-fem, quadratic hexahedra, extrapolated'
     resolutions = (2, 4, 8)
-    _force = 2e-5
+    force = 2e-5
 
     def __init__(self, poissons_ratio: float) -> None:
         self.solid = Solid((0.10, 0.02, 0.02), 5000.0, poissons_ratio)
@@ -166,15 +169,15 @@ class Cantilever:
         held.append(grid.components(x[:, 1] > width / 2 - NEAR, 1))
         area = width * height
         load = grid.traction(
-            lambda p: p[0] > length - NEAR, lambda x, y, z: self._force / area + 0 * x
+            lambda p: p[0] > length - NEAR, lambda x, y, z: self.force / area + 0 * x
         )
         u = grid.solve(load, np.unique(np.concatenate(held)))
-        return float(2 * load @ u / self._force)
+        return float(2 * load @ u / self.force)
 
     def rest(self, model: ModelName, resolution: int) -> Rest:
         """The beam, with so many bricks over its depth, at rest under the load."""
         mesh = beam(self.solid, resolution)
-        load = end_load(mesh, self.solid, self._force)
+        load = end_load(mesh, self.solid, self.force)
         return _linear_response(
             ElasticModel(mesh, material(self.solid), model), load, self.reference.value
         )
