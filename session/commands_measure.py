@@ -64,7 +64,7 @@ def bench(
         bool, typer.Option('--save', help='Keep the figures in bench/results.')
     ] = False,
 ) -> None:
-    """Measure what force, step, cut, proxy, messages, session and start cost here."""
+    """Measure what force, step, frame, cut, proxy, messages, session and start cost here."""
     from session.measure.bench import run_bench
 
     run_bench(names or [], size or [], as_json=as_json, save=save)
