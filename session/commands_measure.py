@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from session.options import EXIT_STATUSES, AsJson, Bench, SceneArgument
+from session.options import EXIT_STATUSES, AsJson, Bench, SceneArgument, Seed
 from session.status import Status
 
 commands = typer.Typer()
@@ -64,7 +64,7 @@ def bench(
         bool, typer.Option('--save', help='Keep the figures in bench/results.')
     ] = False,
 ) -> None:
-    """Measure what force, step, cut, proxy, messages, session and start cost here."""
+    """Measure what force, step, frame, cut, proxy, messages, session and start cost here."""
     from session.measure.bench import run_bench
 
     run_bench(names or [], size or [], as_json=as_json, save=save)
@@ -85,6 +85,29 @@ def bench_scaling(
     from session.measure.bench_scaling import run_scaling
 
     run_scaling(output, size or [], as_json=as_json)
+
+
+@commands.command('bench-strokes', epilog=EXIT_STATUSES)
+def bench_strokes(
+    strokes: Annotated[int, typer.Option(min=1, help='How many.')] = 1000,
+    every: Annotated[int, typer.Option(min=1, help='Look after every so many.')] = 50,
+    size: Annotated[
+        int, typer.Option(min=600, max=1_000_000, help='Tetrahedra at the beginning, about.')
+    ] = 10_000,
+    seed: Seed = 0,
+    growth: Annotated[
+        float, typer.Option(min=1, max=1000, help='tissue.integration.frequency_growth.')
+    ] = 1.5,
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='Folder; charts/ in it takes the picture.')
+    ] = Path('docs'),
+    as_json: AsJson = False,
+) -> None:
+    """Measure time and memory of a session of very many strokes, its mesh checked on the way."""
+    from session.measure.bench_strokes import run_strokes
+
+    options = (output, strokes, every, size, seed, growth)
+    raise typer.Exit(int(run_strokes(*options, as_json=as_json)))
 
 
 @commands.command('compare-cuts', epilog=EXIT_STATUSES)

@@ -38,6 +38,7 @@ class Bench(StrEnum):
 
     FORCE = 'force'
     STEP = 'step'
+    FRAME = 'frame'
     CUT = 'cut'
     PROXY = 'proxy'
     CODEC = 'codec'

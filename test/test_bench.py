@@ -11,6 +11,7 @@ from meshes import box as block
 from session.errors import SessionError
 from session.measure import bench
 from session.measure.bench_flow import session
+from session.measure.bench_frame import frame
 from session.measure.bench_proxy import proxy
 from session.measure.bench_scaling import line, measure
 from session.measure.bench_tissue import box, moved_bytes
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.alone
 @pytest.fixture(scope='module', autouse=True)
 def _short() -> None:
     bench.BENCHES = bench.BENCHES | {
+        Bench.FRAME: (lambda sizes: frame(sizes, frames=40), [300]),
         Bench.PROXY: (lambda: proxy(repeats=1, ticks=50), []),
         Bench.SESSION: (lambda sizes: session(sizes, seconds=0.2), [300]),
         Bench.START: (lambda: bench.start(repeats=1), []),

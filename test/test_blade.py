@@ -11,6 +11,7 @@ from meshes import box
 from tissue_sim.blade import Resistance
 from tissue_sim.contact import Command, Frame, State, ToolContact
 from tissue_sim.dynamics import TimeStepping
+from tissue_sim.locate import barycentric, locate_points
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.simulation import TissueSimulation
@@ -228,3 +229,24 @@ def test_a_frame_that_diverges_is_taken_back_and_the_tool_is_let_go() -> None:
     after = [simulation.frame(None) for _ in range(50)]
     assert not any(f.diverged for f in after)
     assert after[-1].elastic_energy < after[0].elastic_energy
+
+
+def test_points_of_an_edge_are_found_where_a_look_at_every_element_finds_them() -> None:
+    """An edge that sticks out of the tissue, whose upper points lie in no element."""
+    nodes, tets = box((6, 5, 4), 0.005)
+    random = np.random.default_rng(4)
+    mesh = TetMesh(nodes + random.uniform(-4e-4, 4e-4, nodes.shape), tets)
+    for _ in range(20):
+        low = random.uniform(0.0, [0.03, 0.025, 0.02])
+        points = low + np.linspace(0.0, 1.0, 24)[:, None] * np.array([0.004, -0.003, 0.02])
+        found, weights = np.empty(len(points), np.int64), np.empty((len(points), 4))
+        locate_points(mesh.rest, mesh.tetrahedra, mesh.neighbors, points, 0, found, weights)
+        out = np.empty(4)
+        for point, tet, weight in zip(points, found, weights, strict=True):
+            least = [
+                barycentric(mesh.rest, mesh.tetrahedra, k, point, out) for k in range(len(tets))
+            ]
+            assert (tet >= 0) == (max(least) >= -1e-9)
+            if tet >= 0:
+                assert least[tet] >= -1e-9
+                np.testing.assert_allclose(weight @ mesh.rest[mesh.tetrahedra[tet]], point)

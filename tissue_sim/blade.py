@@ -14,12 +14,14 @@ import numpy as np
 from tissue_sim.coupling import HOLD, Coupling
 from tissue_sim.fracture import THICKNESS, Fracture, count_fresh, cut_normal
 from tissue_sim.locate import locate_points
-from tissue_sim.mesh import TetMesh
+from tissue_sim.mesh import TetMesh, tetrahedron_volumes
 
 _SAMPLES = 48
 _LEAST_AREA = 1e-8
 _AHEAD = 1e-4
 """[m] ahead of the edge, where it is asked whether the tissue is cut."""
+_ENOUGH = 20000
+"""Elements that a median is taken of."""
 _MOST_STEPS = 32
 _MOST_SLIPS = 8
 _SETTLED = 1.01
@@ -133,7 +135,9 @@ class Blade:
         """
         self._edge = root - tip
         if self._element == 0.0:
-            self._element = 2 * float(np.cbrt(np.median(mesh.volumes())))
+            some = mesh.tetrahedra[:: 1 + len(mesh.tetrahedra) // _ENOUGH]
+            volumes = tetrahedron_volumes(mesh.rest, some)
+            self._element = 2 * float(np.cbrt(np.median(volumes)))
         start = self._device_tip
         self._device_tip = tip.copy()
         nodes, weights, count = self._immerse(mesh, positions)

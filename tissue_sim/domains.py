@@ -28,7 +28,7 @@ from tissue_sim.rotation import (
     stress,
     turn,
 )
-from tissue_sim.tensor_mass import longer, move_row, shape_gradients
+from tissue_sim.tensor_mass import longer, move_row, packed, shape_gradients
 
 
 class Domains(NamedTuple):
@@ -269,10 +269,6 @@ class NodeDomains:
     def __init__(self, mesh: TetMesh, lame_lambda: float, lame_mu: float) -> None:
         self._mesh = mesh
         self._lame = np.array([lame_lambda, lame_mu])
-        self.rebuild()
-
-    def rebuild(self) -> None:
-        """Computes every row anew, packed in the order of the nodes."""
         n = self._mesh.node_count
         tets = self._mesh.tetrahedra.astype(np.int64)
         pairs = [tets[:, [i, j]] for i in range(4) for j in range(4)]
@@ -312,8 +308,10 @@ class NodeDomains:
         if len(self._domains.room) > known:
             self._domains.room[known:] = 0
         self._gather(np.asarray(nodes, np.int64))
-        if self._filled[0] > 4 * int(self._domains.used[:n].sum()) + 4096:
-            self.rebuild()
+        d = self._domains
+        rows = d.start, d.used, d.room, n
+        columns, vectors = packed(*rows, d.columns, d.vectors, self._filled)
+        self._domains = d._replace(columns=columns, vectors=vectors)
 
     def _gather(self, nodes: np.ndarray) -> None:
         while len(nodes):

@@ -56,17 +56,43 @@ def _walk(positions, tetrahedra, neighbors, point, start, out):
 
 
 @njit(cache=True)
-def _search(positions, tetrahedra, point, out):
-    """Looks at every tetrahedron whose box holds the point."""
+def _near(positions, tetrahedra, points):
+    """The tetrahedra whose boxes meet the box of some points, in order."""
+    low, high = points[0].copy(), points[0].copy()
+    for k in range(1, len(points)):
+        for i in range(3):
+            low[i], high[i] = min(low[i], points[k, i]), max(high[i], points[k, i])
+    out = np.empty(len(tetrahedra), np.int64)
+    count = 0
     for tet in range(len(tetrahedra)):
+        meets = True
+        for i in range(3):
+            if not _spans(positions, tetrahedra, tet, i, low[i], high[i]):
+                meets = False
+                break
+        if meets:
+            out[count] = tet
+            count += 1
+    return out[:count]
+
+
+@njit(cache=True)
+def _spans(positions, tetrahedra, tet, axis, low, high):
+    """Whether a tetrahedron's box meets an interval of an axis."""
+    a = positions[tetrahedra[tet, 0], axis]
+    b = positions[tetrahedra[tet, 1], axis]
+    c = positions[tetrahedra[tet, 2], axis]
+    d = positions[tetrahedra[tet, 3], axis]
+    return min(min(a, b), min(c, d)) <= high and low <= max(max(a, b), max(c, d))
+
+
+@njit(cache=True)
+def _search(positions, tetrahedra, near, point, out):
+    """Looks at every tetrahedron of some whose box holds the point."""
+    for tet in near:
         inside = True
         for i in range(3):
-            a = positions[tetrahedra[tet, 0], i]
-            b = positions[tetrahedra[tet, 1], i]
-            c = positions[tetrahedra[tet, 2], i]
-            d = positions[tetrahedra[tet, 3], i]
-            low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-            if point[i] < low or point[i] > high:
+            if not _spans(positions, tetrahedra, tet, i, point[i], point[i]):
                 inside = False
                 break
         if inside and barycentric(positions, tetrahedra, tet, point, out) >= _INSIDE:
@@ -78,7 +104,8 @@ def _search(positions, tetrahedra, point, out):
 def locate_points(positions, tetrahedra, neighbors, points, hint, found, weights):
     """Finds the tetrahedra that hold some points: a walk from the last one, else a search.
 
-    A walk fails where the body is not convex, across an open cut above all.
+    A walk fails where the body is not convex, across an open cut above all, and outside. The first
+    search lists the tetrahedra near all of the points; it and the others look at these.
 
     Args:
         positions: node positions [m], shape (n, 3).
@@ -90,10 +117,14 @@ def locate_points(positions, tetrahedra, neighbors, points, hint, found, weights
         weights: output, barycentric coordinates, shape (p, 4).
     """
     tet = min(max(hint, 0), len(tetrahedra) - 1)
+    near = np.empty(0, np.int64)
+    listed = False
     for k in range(len(points)):
         at = _walk(positions, tetrahedra, neighbors, points[k], tet, weights[k])
         if at < 0:
-            at = _search(positions, tetrahedra, points[k], weights[k])
+            if not listed:
+                near, listed = _near(positions, tetrahedra, points), True
+            at = _search(positions, tetrahedra, near, points[k], weights[k])
         found[k] = at
         if at >= 0:
             tet = at

@@ -105,6 +105,55 @@ def move_row(start, used, room, columns, values, filled, node):
 
 
 @njit(cache=True)
+def _pack(start, used, room, count, columns, values, packed_columns, packed_values):
+    width, at = values.shape[0] // columns.shape[0], 0
+    for node in range(count):
+        first = start[node]
+        for k in range(used[node]):
+            packed_columns[at + k] = columns[first + k]
+            for i in range(width):
+                packed_values[width * (at + k) + i] = values[width * (first + k) + i]
+        start[node], room[node] = at, used[node]
+        at += used[node]
+    room[count:] = 0
+
+
+def packed(
+    start: np.ndarray,
+    used: np.ndarray,
+    room: np.ndarray,
+    count: int,
+    columns: np.ndarray,
+    values: np.ndarray,
+    filled: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and values with the rows side by side again, where half of all slots lie idle.
+
+    No number changes and no order does, so neither does a result: it may be done between any two
+    frames, and costs a copy.
+
+    Args:
+        start, used, room: see `Tensors`; changed, shape (>= count,).
+        count: of nodes.
+        columns: of all rows, shape (c,).
+        values: as many for each column, shape (w c,).
+        filled: slots that are given to rows; changed, shape (1,).
+
+    Returns:
+        The two given, or two new ones with spare room for as much again.
+    """
+    slots = int(used[:count].sum())
+    if filled[0] <= 2 * slots + 4096:
+        return columns, values
+    width = len(values) // len(columns)
+    most = 2 * slots
+    out = np.zeros(most, columns.dtype), np.zeros(width * most)
+    _pack(start, used, room, count, columns, values, *out)
+    filled[0] = slots
+    return out
+
+
+@njit(cache=True)
 def _edge_slot(tensors, filled, node, column):
     """The slot of an edge in the row of `node`, made if there is room; -1 if there is none."""
     first = tensors.start[node]
@@ -238,10 +287,6 @@ class TensorMass:
     def __init__(self, mesh: TetMesh, lame_lambda: float, lame_mu: float) -> None:
         self._mesh = mesh
         self._lame = (lame_lambda, lame_mu)
-        self.rebuild()
-
-    def rebuild(self) -> None:
-        """Computes every row anew, packed in the order of the nodes."""
         n = self._mesh.node_count
         room = np.zeros(n, np.int64)
         tets = np.sort(self._mesh.tetrahedra, axis=1).astype(np.int64)
@@ -281,8 +326,10 @@ class TensorMass:
         if len(self.tensors.room) > known:
             self.tensors.room[known:] = 0
         self._gather(np.asarray(nodes, np.int64))
-        if self._filled[0] > 4 * int(self.tensors.used[:n].sum()) + 4096:
-            self.rebuild()
+        t = self.tensors
+        rows = t.start, t.used, t.room, n
+        columns, blocks = packed(*rows, t.columns, t.blocks, self._filled)
+        self.tensors = t._replace(columns=columns, blocks=blocks)
 
     def _gather(self, nodes: np.ndarray) -> None:
         mesh, remaining = self._mesh, nodes

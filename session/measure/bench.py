@@ -17,6 +17,7 @@ from session.errors import SessionError
 from session.measure.bench_clock import Figure, by_turns, figure, stream
 from session.measure.bench_cut import cut
 from session.measure.bench_flow import codec, session, start
+from session.measure.bench_frame import frame
 from session.measure.bench_proxy import proxy
 from session.measure.bench_tissue import force, step
 from session.options import Bench
@@ -27,6 +28,7 @@ _BANDWIDTHS = (1, 10, 40, 100)
 BENCHES: dict[Bench, tuple[Callable[..., list[Figure]], list[int]]] = {
     Bench.FORCE: (force, [1_000, 10_000, 50_000, 200_000]),
     Bench.STEP: (step, [10_000, 50_000]),
+    Bench.FRAME: (frame, [10_000, 50_000, 200_000]),
     Bench.CUT: (cut, [2_000, 20_000, 200_000]),
     Bench.PROXY: (proxy, []),
     Bench.CODEC: (codec, [10_000, 200_000]),

@@ -1,0 +1,454 @@
+"""What a session of very many strokes costs: the command `trainer bench-strokes`.
+
+A blade is drawn through a tissue all over, cut after cut, at times once more along an old one or
+across it; pieces fall off. Tissue and cutting run in one process, the answer of the cutting a frame
+late as in the graph. Every so many strokes some frames of a palpation are timed, the arrays are
+counted, and the mesh is held against what a cut must keep.
+"""
+
+import json
+import resource
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich import box as borders
+from rich.console import Console
+from rich.table import Table
+
+from cutting.checks import ViolationError, check_mesh, lips, pieces
+from cutting.combined import FOLDED
+from cutting.method import CutResult
+from cutting.methods import make_method
+from cutting.settings import CuttingSettings
+from cutting.warm_up import warm_up as warm_up_cutting
+from session.errors import SessionError
+from session.in_process import Tissue
+from session.measure.bench_tissue import SIZE, box, liver_material
+from session.scene import load_scene
+from session.status import Status
+from tissue_sim.blade import Resistance
+from tissue_sim.contact import State, ToolContact, press_triangle
+from tissue_sim.dynamics import TimeStepping
+from tissue_sim.elasticity import ModelName
+from tissue_sim.locate import closest_triangle
+from tissue_sim.mesh import TetMesh
+from tissue_sim.simulation import TissueSimulation
+from tissue_sim.topology import OUTER
+from tissue_sim.warm_up import warm_up
+
+LIMIT = 2.0
+"""Frame time by live element and arrays' bytes by live element: the most at the end, over those of
+the beginning."""
+GROWTH = 1.5
+"""How far cuts may raise the highest frequency: the step of the whole tissue follows it."""
+_STIFFNESS, _RADIUS, _BLADE = 200.0, 0.004, 0.03
+"""[N/m] of the tool's spring, [m] of its tip's sphere and of its edge."""
+_STEP = 5e-3
+"""[m] that the blade goes in a frame: 150 mm/s."""
+_REPEATED = 0.3
+"""Share of the strokes that go along an earlier one or across it."""
+_PLACES, _WARM, _FRAMES = 4, 6, 12
+_DEPTH = 1e-3
+"""[m] that a palpation goes in: not enough to let the blade in."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """The session after so many strokes.
+
+    Attributes:
+        strokes, tetrahedra, nodes, triangles: how many there are.
+        loose: pieces that no fixed node holds.
+        substeps: of a palpated frame.
+        median, high: processor time of a palpated frame [ms], and its ninetieth percentile.
+        uncut: the same frame of the uncut tissue, measured by turns with it, median [ms].
+        by_element: how much more a live element costs than one of the uncut tissue, median over
+            frame times that were measured one after the other [-].
+        stroke, worst: frames of the strokes since the row before, cutting included, median and
+            largest [ms].
+        arrays: all of tissue and cutting [bytes].
+        resident: memory of the process, the uncut tissue's included [bytes].
+        troubles: frames since the row before that the guard mended or took back.
+        added: mass that the tissue is moved with beyond its own, as a share of it [-].
+    """
+
+    strokes: int
+    tetrahedra: int
+    nodes: int
+    triangles: int
+    loose: int
+    substeps: int
+    median: float
+    high: float
+    uncut: float
+    by_element: float
+    stroke: float
+    worst: float
+    arrays: int
+    resident: int
+    troubles: int
+    added: float
+
+
+class _Noting:
+    """The method of cutting, and what it says of the stroke."""
+
+    def __init__(self) -> None:
+        self._method = make_method(CuttingSettings())
+        self.folded = False
+
+    def advance(self, *arguments: Any) -> CutResult:
+        return self._noted(self._method.advance(*arguments))
+
+    def finish(self, *arguments: Any) -> CutResult:
+        return self._noted(self._method.finish(*arguments))
+
+    def abort(self) -> None:
+        self._method.abort()
+
+    def _noted(self, result: CutResult) -> CutResult:
+        self.folded |= FOLDED in result.report.warnings
+        return result
+
+
+def blade_contact(
+    mesh: TetMesh, state: State, place: np.ndarray, tip: np.ndarray, up: np.ndarray
+) -> ToolContact:
+    """A blade along a normal of the surface, that touches where it is not in the tissue yet.
+
+    Args:
+        mesh: the tissue.
+        state: TOUCHING, or NONE: it has left.
+        place: of the surface at rest where it goes in [m], shape (3,).
+        tip: of the blade [m], shape (3,).
+        up: outward unit normal there, shape (3,).
+    """
+    nodes = mesh.triangles[closest_triangle(place, mesh.rest, mesh.triangles)].astype(np.int64)
+    return ToolContact(
+        state=state,
+        topology=mesh.topology,
+        nodes=nodes,
+        weights=np.full(3, 1 / 3),
+        device=tip,
+        offset=np.zeros(3),
+        normal=up,
+        stiffness=_STIFFNESS,
+        radius=_RADIUS,
+        blade_root=tip + _BLADE * up,
+        blade_tip=tip,
+    )
+
+
+class Session:
+    """A tissue that is cut by random strokes.
+
+    Args:
+        size: tetrahedra at the beginning, about.
+        seed: of the strokes.
+        model: of the tissue's elasticity.
+        growth: how far cuts may raise the highest frequency [-], see `TimeStepping`.
+    """
+
+    def __init__(
+        self, size: int, seed: int = 0, model: ModelName = 'linear', growth: float = GROWTH
+    ) -> None:
+        self._kind = size, seed, model, growth
+        scene = load_scene('liver').tissue
+        m = scene.material
+        self.simulation = TissueSimulation(
+            box(size),
+            liver_material(),
+            Resistance(scene.cut_threshold, m.toughness, m.blade_friction),
+            model=model,
+            stepping=TimeStepping('symplectic_euler', max_substeps=1000, frequency_growth=growth),
+        )
+        self._method = _Noting()
+        self._tissue = Tissue(self.simulation, self._method)
+        self._random = np.random.default_rng(seed)
+        self._volume = float(self.simulation.mesh.volumes().sum())
+        self._ways: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self._lips = lips(self.simulation.mesh)
+        self.strokes = self.substeps = 0
+        self.troubles: list[str] = []
+
+    def twin(self) -> 'Session':
+        """Another of the same kind, uncut, to be measured beside it."""
+        return Session(*self._kind)
+
+    def stroke(self) -> list[float]:
+        """Cuts once; processor time of each frame [ms]."""
+        self.strokes += 1
+        start, end, up = self._way()
+        mesh = self.simulation.mesh
+        self._lips, self._method.folded = lips(mesh), False
+        depth = self._random.uniform(0.006, 0.014)
+        down = np.arange(0.0, depth, _STEP)
+        steps = max(int(np.ceil(np.linalg.norm(end - start) / _STEP)), 1)
+        tips = [start - up * way for way in down]
+        tips += list(np.linspace(start, end, steps + 1) - up * depth)
+        times = [self._frame(blade_contact(mesh, State.TOUCHING, start, tip, up)) for tip in tips]
+        times.append(self._frame(blade_contact(mesh, State.NONE, start, tips[-1], up)))
+        return times + [self._frame(None) for _ in range(2)]  # that finish the cut
+
+    def _frame(self, contact: ToolContact | None) -> float:
+        begin = time.thread_time()
+        frame = self._tissue.frame(contact)
+        spent = 1e3 * (time.thread_time() - begin)
+        self.substeps = frame.substeps
+        if frame.trouble:
+            self.troubles.append(f'frame {frame.step}: {frame.trouble}')
+        return spent
+
+    def _way(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where a stroke begins and ends on the surface at rest [m], and its outward normal."""
+        random, mesh = self._random, self.simulation.mesh
+        if self._ways and random.random() < _REPEATED:
+            start, end, up = self._ways[random.integers(len(self._ways))]
+            shift = random.uniform(-1e-3, 1e-3, 3)
+            if random.random() < 0.5:
+                return start + shift, end + shift, up
+            across, middle = np.cross(up, end - start) / 2, (start + end) / 2 + shift
+            return middle - across, middle + across, up
+        corners = mesh.rest[mesh.triangles]
+        outer = (mesh.triangle_kind == OUTER) & ~mesh.fixed[mesh.triangles].any(axis=1)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.where(outer, np.linalg.norm(normals, axis=1), 0.0)
+        at = random.choice(len(areas), p=areas / areas.sum())
+        up = normals[at] / areas[at]
+        along = np.cross(up, random.normal(size=3))
+        along *= random.uniform(0.008, 0.025) / np.linalg.norm(along)
+        middle = corners[at].mean(axis=0)
+        way = (middle - along / 2, middle + along / 2, up)
+        self._ways.append(way)
+        return way
+
+    def palpate(self) -> Iterator[tuple[float, int]]:
+        """Presses at some places of the top; yields each frame's time [ms] and substeps."""
+        down = np.array([0.0, 0.0, -1.0])
+        for k in range(_PLACES):
+            place = np.array(SIZE) * (0.3 + 0.4 * (k % 2), 0.3 + 0.4 * (k // 2), 1.0)
+            for number in range(_WARM + _FRAMES):
+                depth = _DEPTH * min(number / _WARM, 1.0)
+                contact = press_triangle(self.simulation.mesh, place, down, depth)
+                spent = self._frame(contact)
+                if number >= _WARM:
+                    yield spent, self.substeps
+            self._frame(None)
+
+    def check(self) -> None:
+        """Holds the mesh against what a cut must keep.
+
+        Raises:
+            ViolationError: saying what is broken, and where.
+        """
+        mesh = self.simulation.mesh
+        old = lips(mesh) if self._method.folded else self._lips
+        check_mesh(mesh, self._volume, old, tolerance=1e-9)
+
+    @property
+    def loose(self) -> int:
+        """Pieces that no fixed node holds."""
+        mesh, piece = self.simulation.mesh, pieces(self.simulation.mesh)
+        held = mesh.fixed[mesh.tetrahedra].any(axis=1)
+        return len(np.setdiff1d(piece, piece[held]))
+
+    @property
+    def added_mass(self) -> float:
+        """Mass that the tissue is moved with beyond its own, as a share of it [-]."""
+        dynamics = self.simulation.dynamics
+        free = dynamics.inverse_mass[::3] > 0
+        mass = dynamics.model.mass[free]
+        return float((1.0 / dynamics.inverse_mass[::3][free]).sum() / mass.sum() - 1.0)
+
+    @property
+    def bytes(self) -> int:
+        """All arrays of tissue and cutting."""
+        return array_bytes([self.simulation, self._method])
+
+
+def array_bytes(root: object) -> int:
+    """What the arrays that an object holds, itself or through others, take; each once."""
+    seen: set[int] = set()
+    left, total = [root], 0
+    while left:
+        thing = left.pop()
+        if id(thing) in seen:
+            continue
+        seen.add(id(thing))
+        if isinstance(thing, np.ndarray):
+            if thing.base is None:
+                total += thing.nbytes
+            else:
+                left.append(thing.base)
+        elif isinstance(thing, dict):
+            left += thing.values()
+        elif isinstance(thing, list | tuple):
+            left += thing
+        elif hasattr(thing, '__dict__'):
+            left += vars(thing).values()
+    return total
+
+
+def measure(
+    session: Session, strokes: int, every: int, told: Callable[[Row], None] = lambda row: None
+) -> list[Row]:
+    """Cuts, and looks at the session before the first stroke and after every so many.
+
+    Args:
+        session: not cut yet.
+        strokes: how many.
+        every: so many, a row.
+        told: each row as it comes.
+
+    Raises:
+        ViolationError: an invariant is broken.
+    """
+    uncut = session.twin()
+    rows: list[Row] = []
+    times: list[float] = []
+    for done in range(strokes + 1):
+        if done:
+            times += session.stroke()
+        if done % every == 0 or done == strokes:
+            rows.append(_look(session, uncut, done, times))
+            told(rows[-1])
+            times = []
+    return rows
+
+
+def _look(session: Session, uncut: Session, done: int, times: list[float]) -> Row:
+    session.check()
+    troubles = len(session.troubles)
+    pairs = list(zip(session.palpate(), uncut.palpate(), strict=True))
+    ours = np.array([mine for (mine, _), _ in pairs])
+    theirs = np.array([other for _, (other, _) in pairs])
+    mesh = session.simulation.mesh
+    elements = len(mesh.tetrahedra) / len(uncut.simulation.mesh.tetrahedra)
+    session.troubles.clear()
+    return Row(
+        strokes=done,
+        tetrahedra=len(mesh.tetrahedra),
+        nodes=mesh.node_count,
+        triangles=len(mesh.triangles),
+        loose=session.loose,
+        substeps=pairs[-1][0][1],
+        median=float(np.median(ours)),
+        high=float(np.percentile(ours, 90)),
+        uncut=float(np.median(theirs)),
+        by_element=float(np.median(ours / theirs)) / elements,
+        stroke=float(np.median(times)) if times else 0.0,
+        worst=max(times, default=0.0),
+        arrays=session.bytes,
+        resident=_resident(),
+        troubles=troubles,
+        added=session.added_mass,
+    )
+
+
+def _resident() -> int:
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * resource.getpagesize()
+
+
+def run_strokes(
+    output: Path, strokes: int, every: int, size: int, seed: int, growth: float, *, as_json: bool
+) -> Status:
+    """Measures, prints, and writes the picture and its figures.
+
+    Args:
+        output: folder; charts/ in it takes the picture.
+        strokes: how many.
+        every: so many, a row.
+        size: of the tissue at the beginning [tetrahedra], about.
+        seed: of the strokes.
+        growth: `integration.frequency_growth`.
+
+    Raises:
+        SessionError: an invariant is broken.
+    """
+    warm_up()
+    warm_up_cutting(CuttingSettings())
+    console = Console(soft_wrap=True, highlight=False)
+    progress = Console(stderr=True, highlight=False)
+
+    def told(row: Row) -> None:
+        progress.print(f'{row.strokes} of {strokes} strokes, {row.tetrahedra} tetrahedra')
+
+    session = Session(size, seed, growth=growth)
+    try:
+        rows = measure(session, strokes, every, told)
+    except ViolationError as error:
+        raise SessionError(f'after stroke {session.strokes}: {error}') from None
+    folder = output / 'charts'
+    folder.mkdir(parents=True, exist_ok=True)
+    picture(rows).savefig(folder / 'strokes.png', dpi=110, bbox_inches='tight')
+    report = [asdict(row) for row in rows]
+    (folder / 'strokes.json').write_text(json.dumps(report, indent=1) + '\n')
+    time_ratio, memory_ratio = ratios(rows)
+    if as_json:
+        console.out(json.dumps(report, indent=2), highlight=False)
+    else:
+        console.print(_table(rows))
+        console.print(
+            f'at the end a live element costs {time_ratio:.2f} times the time and '
+            f'{memory_ratio:.2f} times the memory of the beginning; at most {LIMIT:g} is allowed'
+        )
+    return Status.FAILED if max(time_ratio, memory_ratio) > LIMIT else Status.OK
+
+
+def ratios(rows: list[Row]) -> tuple[float, float]:
+    """Frame time and arrays by live element at the end, over those of the beginning [-]."""
+    first, last = rows[0], rows[-1]
+    arrays = last.arrays / last.tetrahedra / (first.arrays / first.tetrahedra)
+    return last.by_element / first.by_element, arrays
+
+
+def _table(rows: list[Row]) -> Table:
+    table = Table(title='Session of strokes', box=borders.SIMPLE_HEAD, title_justify='left')
+    heads = (
+        'strokes', 'tetrahedra', 'triangles', 'loose', 'substeps', 'frame [ms]', 'p90',
+        'by element', 'stroke [ms]', 'worst', 'arrays [MB]', 'process [MB]', 'troubles',
+    )  # fmt: skip
+    for head in heads:
+        table.add_column(head, justify='right')
+    for row in rows:
+        table.add_row(
+            *(
+                f'{n}'
+                for n in (row.strokes, row.tetrahedra, row.triangles, row.loose, row.substeps)
+            ),
+            *(f'{x:.3g}' for x in (row.median, row.high, row.by_element, row.stroke, row.worst)),
+            *(f'{1e-6 * x:.3g}' for x in (row.arrays, row.resident)),
+            f'{row.troubles}',
+        )
+    return table
+
+
+def picture(rows: list[Row]) -> Figure:
+    """Frame time and memory by live element over the strokes, both over the beginning."""
+    figure = Figure(figsize=(7, 4))
+    axes = figure.add_subplot()
+    strokes, first = [row.strokes for row in rows], rows[0]
+    share = [row.tetrahedra / first.tetrahedra for row in rows]
+    lines = {
+        'frame time by live element': [row.by_element / first.by_element for row in rows],
+        'arrays by live element': [
+            row.arrays / first.arrays / much for row, much in zip(rows, share, strict=True)
+        ],
+        'live elements': share,
+        'substeps a frame': [row.substeps / first.substeps for row in rows],
+    }
+    for name, values in lines.items():
+        axes.plot(strokes, values, marker='o', ms=3, label=name)
+    axes.axhline(LIMIT, color='grey', lw=0.8, ls='--')
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel('strokes')
+    axes.set_ylabel('over the beginning [-]')
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return figure
