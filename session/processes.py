@@ -197,7 +197,9 @@ class Supervisor:
         deaths = len(self.outcome.deaths)
         for records in (True, False):
             for command in commands:
-                if command.records == records and not self._interrupts:
+                if command.records == records:
+                    if self._interrupts:
+                        return False
                     self._start(command)
             if not self._wait_ready(deadline, timeout, deaths):
                 return False
@@ -271,10 +273,12 @@ class Supervisor:
         node.close()
 
     def _wait_ready(self, deadline: float, timeout: float, deaths: int) -> bool:
-        while not self._interrupts and len(self.outcome.deaths) == deaths:
+        while len(self.outcome.deaths) == deaths:
             waiting = [node for node in self._nodes.values() if node.alive and not node.ready]
             if not waiting:
                 return True
+            if self._interrupts:
+                return False
             if time.monotonic() > deadline:
                 self.outcome.unready = _unready(waiting, timeout)
                 return False

@@ -284,6 +284,21 @@ def test_signal_during_the_session_ends_everything(ledger: Ledger, number: signa
     assert asked[-1][0] == 'recorder'
 
 
+def test_interrupt_at_the_moment_when_all_are_ready_ends_a_session_that_was(
+    tmp_path: Path, ledger: Ledger
+) -> None:
+    def interrupt(event: Event) -> None:
+        if event.kind == 'ready':
+            signal.raise_signal(signal.SIGINT)
+
+    nodes = [command('viewer', ledger)]
+    with Supervisor(nodes, tmp_path / 'log', ENVIRONMENT, interrupt) as supervisor:
+        assert supervisor.start()
+        supervisor.run(60.0)
+        outcome = supervisor.end()
+    assert outcome.ran and outcome.interrupted and not outcome.deaths
+
+
 def test_interrupt_before_all_are_ready_ends_everything(ledger: Ledger) -> None:
     launcher = launch(ledger, 'mute')
     wait_for(lambda: ledger.entries('start'))
