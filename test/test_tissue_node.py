@@ -2,14 +2,16 @@
 
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from cutting_trainer_msgs.msg import Contact, ForceSample
+from cutting_trainer_msgs.msg import Contact, ForceSample, FrameInputs
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from live import free_domain, two_presses, wait_for, write_scene
 
@@ -66,10 +68,10 @@ class Tool:
         rclpy.shutdown(context=self._context)
 
 
-@pytest.fixture
-def tool(tmp_path: Path) -> Iterator[Tool]:
-    domain, scene = free_domain(), write_scene(tmp_path, two_presses(), 7.0, 20.0)
-    with (tmp_path / 'log').open('w') as log:
+@contextmanager
+def running(folder: Path, scene: Path, domain: int) -> Iterator['subprocess.Popen[str]']:
+    """The node as a process."""
+    with (folder / 'log').open('w') as log:
         process = subprocess.Popen(
             [sys.executable, '-m', 'tissue_sim.node', '--ros-args', '-p', f'scene:={scene}'],
             cwd=ROOT,
@@ -78,6 +80,17 @@ def tool(tmp_path: Path) -> Iterator[Tool]:
             stderr=log,
             text=True,
         )
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def tool(tmp_path: Path) -> Iterator[Tool]:
+    domain, scene = free_domain(), write_scene(tmp_path, two_presses(), 7.0, 20.0)
+    with running(tmp_path, scene, domain) as process:
         tool = Tool(scene, domain)
         try:
             assert process.stdout is not None
@@ -85,8 +98,26 @@ def tool(tmp_path: Path) -> Iterator[Tool]:
             yield tool
         finally:
             tool.close()
-            process.kill()
-            process.wait()
+
+
+def test_a_recorder_that_takes_a_moment_to_find_the_node_has_its_first_frame(
+    tmp_path: Path,
+) -> None:
+    domain, scene = free_domain(), write_scene(tmp_path, two_presses(), 7.0, 20.0)
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node('recorder', context=context)
+    try:
+        with running(tmp_path, scene, domain):
+            topic = f'/{ros.FRAME_INPUTS}'
+            wait_for(lambda: topic in dict(node.get_topic_names_and_types()), topic)
+            time.sleep(0.2)
+            inputs = ros.polled(node, FrameInputs, ros.FRAME_INPUTS, ros.STREAM)
+            first = wait_for(lambda: ros.take(inputs), 'a frame')
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+    assert first.step == 1
 
 
 def wait_until_felt(tool: Tool) -> None:

@@ -35,6 +35,8 @@ _SUSPICION = 5.0
 _CHECKPOINT_SECONDS = 0.5
 """Between two meshes that go to the checkpoint because of cuts."""
 _CUT_TIMEOUT_NS = 1_000_000_000
+_FOUND = 0.5
+"""[s] in which a recorder that is there has found a new topic, and subscribed to it."""
 
 
 class TissueSimNode(ManagedNode):
@@ -122,6 +124,7 @@ class TissueSimNode(ManagedNode):
 
     def work(self, stop: Stop) -> None:
         """Runs frames to the end."""
+        self._await_recorder(stop)
         with self._lock:
             self._publish_keyframe()
         announce_ready(self)
@@ -133,6 +136,14 @@ class TissueSimNode(ManagedNode):
             with self._lock:
                 self._tick()
             self._diagnostics.catch_up()
+
+    def _await_recorder(self, stop: Stop) -> None:
+        """Lets a recorder find the inputs of frames: only a whole record is computed again."""
+        until = time.monotonic() + _FOUND
+        while self._inputs.get_subscription_count() == 0 and time.monotonic() < until:
+            if stop.is_set():
+                return
+            time.sleep(0.005)
 
     def release(self) -> None:
         """Ends the thread of the checkpoint."""
