@@ -8,8 +8,10 @@ MEMORY = 1.0
 """[s] in which numbers that go back twice are those of two senders; once is a restart."""
 QUEUED = 3.0
 """[s] for which messages of a network may come late before it is the clock that was set back."""
-FORGETTING = 0.01
-"""Share by which a message more late than before moves what counts as in time."""
+FORGETTING = 0.3
+"""[1/s] at which later messages than before move what counts as in time."""
+LONGEST = 0.02
+"""[s] since the message before that count for that: a burst out of a queue hardly moves it."""
 _NANOSECONDS = 1_000_000_000
 
 
@@ -42,6 +44,7 @@ class StreamWatch:
         self._went_back: int | None = None
         self._two_seen: int | None = None
         self._offset: int | None = None
+        self._seen = 0
         self._frame: str | None = None
 
     def see(self, number: int, stamp_ns: int, now_ns: int, frame: str = '') -> str:
@@ -92,9 +95,11 @@ class StreamWatch:
         if self._queues and self._falls_behind(jump, now_ns):
             return ''
         if self._queues and -CLOCK_JUMP <= jump < 0:
-            self._offset = usual + round(FORGETTING * (offset - usual))
+            share = FORGETTING * min((now_ns - self._seen) / _NANOSECONDS, LONGEST)
+            self._offset = usual + round(share * (offset - usual))
         else:
             self._offset = offset
+        self._seen = now_ns
         if abs(jump) <= CLOCK_JUMP:
             return ''
         return (
