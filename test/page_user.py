@@ -84,7 +84,7 @@ class Eye:
 
 def way(start: np.ndarray, axis: np.ndarray, length: float) -> np.ndarray:
     """Places from a grip on the arrow along an axis to `length` further [m], shape (n, 3)."""
-    shares = np.concatenate([[0.0, 0.02], np.linspace(0.05, 1.0, 20)])
+    shares = np.concatenate([[0.0, 0.02], np.linspace(0.1, 1.0, 8)])
     return start + np.outer(GRIP + shares * length, axis)
 
 
