@@ -43,8 +43,10 @@ from tissue_sim.ros import (
     polled,
 )
 from tissue_sim.share import share_folder
+from tissue_sim.timing import request_preference
 
 _POLL = 0.004
+_NICENESS = -5
 _DISCOVER = 0.02
 _REVIEW = 1.0
 _FLUSH = 0.2
@@ -152,6 +154,7 @@ class Recorder(ManagedNode):
 
     def work(self, stop: Stop) -> None:
         """Records until `stop` is set."""
+        self.get_logger().info(request_preference(_NICENESS))
         self._forget()
         self.discover()
         announce_ready(self)

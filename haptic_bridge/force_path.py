@@ -6,6 +6,7 @@ the tissue (`Contact.external_force`); what the tissue answers, extrapolated, is
 feels.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,7 +41,7 @@ what a press of 5 mm on liver stores: below it are encoder steps and errors of e
 POSE, FORCE = 'arm/measured_cp', 'tissue/force'
 _INVALID = MessageError('marked invalid', 'its stamp is 0')
 _OUTDATED = MessageError('not newer than the one before')
-_NOWHERE = ((0,) * 9, (0.0,) * 9, (0.0,) * 3, (0.0,) * 3)
+_NOWHERE = ([0] * 9, [0.0] * 9, [0.0] * 3, [0.0] * 3)
 
 
 class Tick(NamedTuple):
@@ -99,6 +100,10 @@ class ForcePath:
         self._setup = chain.make_setup(tool, device, haptics, profile)
         self._state = np.zeros(1, chain.STATE)
         self._s: Any = self._state[0]
+        names = ('force', 'wrench', 'tip', 'external', 'blade')
+        self._force, self._wrench, self._tip, self._external, self._blade = map(
+            self._s.__getitem__, names
+        )
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._proxy = CONTACTS[haptics.contact](tool.radius)
         self._tail = (tool.coupling_stiffness, tool.radius)
@@ -132,7 +137,7 @@ class ForcePath:
     @property
     def force_norm(self) -> float:
         """Norm of the commanded force [N]."""
-        return float(np.linalg.norm(self._s['force']))
+        return math.hypot(*self._force.tolist())
 
     @property
     def is_stale(self) -> bool:
@@ -222,7 +227,7 @@ class ForcePath:
         if self._contact != NONE:
             self.contact_time += elapsed
         self.max_force = max(self.max_force, self.force_norm)
-        wrench = (*self._s['wrench'].tolist(), 0.0, 0.0, 0.0)
+        wrench = (*self._wrench.tolist(), 0.0, 0.0, 0.0)
         return Tick(wrench, self._contact_values(surface, touched), self._pose_stamp, fault)
 
     def _take_pose(self, now_ns: int, pose: Sample | None, enabled: bool) -> str:
@@ -323,20 +328,20 @@ class ForcePath:
                 self._proxy.reset()
                 self._ground.release()
             self._contact = INSIDE
-            self._s['proxy'] = self._s['tip']
+            self._s['proxy'] = self._tip
             return None
         if before == INSIDE or (before == TOUCHING and not enabled):
             self._leave_contact()
             self._start_ns = now_ns
         if not enabled or surface is None:
-            self._s['proxy'] = self._s['tip']
+            self._s['proxy'] = self._tip
             return None
         ground = self._ground.surface
         assert ground is not None
-        touched = self._proxy.step(ground, self._ground.blend(now_ns), self._s['tip'])
+        touched = self._proxy.step(ground, self._ground.blend(now_ns), self._tip)
         self._s['proxy'] = touched.position
         slot = self._sequence % _REMEMBERED
-        self._depths[slot] = touched.position - self._s['tip']
+        self._depths[slot] = touched.position - self._tip
         self._contact = TOUCHING if touched.touching else NONE
         if self._contact != before:
             extrapolation.clear(self._history)
@@ -360,15 +365,17 @@ class ForcePath:
             self._current_ns = now_ns
 
     def _contact_values(self, surface: Surface | None, touched: Any) -> tuple[float, ...]:
-        s = self._s
+        # Lists: for three numbers an operation of numpy takes ten times as long.
+        stiffness, radius = self._tail
+        tip, external = self._tip.tolist(), self._external.tolist()
+        proxy = [t - e / stiffness for t, e in zip(tip, external, strict=True)]
         revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
         nodes, weights, point, normal = _NOWHERE
-        proxy = s['tip'] - s['external'] / self._tail[0]
         if touched is not None:
-            nodes = np.maximum(touched.nodes, 0).tolist()
-            weights = touched.weights.tolist()
-            point = (proxy + (touched.contact - touched.position)).tolist()
-            normal = touched.normal.tolist()
+            nodes = [max(node, 0) for node in touched.nodes.tolist()]
+            weights, normal = touched.weights.tolist(), touched.normal.tolist()
+            contact, position = touched.contact.tolist(), touched.position.tolist()
+            point = [p + (c - q) for p, c, q in zip(proxy, contact, position, strict=True)]
         return (
             self._sequence,
             self._contact,
@@ -376,12 +383,12 @@ class ForcePath:
             topology,
             *nodes,
             *weights,
-            *s['tip'].tolist(),
-            *proxy.tolist(),
+            *tip,
+            *proxy,
             *point,
             *normal,
-            *s['external'].tolist(),
-            self._tail[0],
-            *s['blade'].ravel().tolist(),
-            self._tail[1],
+            *external,
+            stiffness,
+            *self._blade.ravel().tolist(),
+            radius,
         )

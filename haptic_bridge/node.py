@@ -2,7 +2,6 @@
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,16 +37,17 @@ from tissue_sim.refusals import require_frame
 from tissue_sim.scene_file import read_section
 from tissue_sim.timing import Durations, PeriodicLoop
 
-FOLLOW_PERIOD = 0.0015
-"""[s] between two looks for frames of the simulation."""
+FOLLOW_PERIOD = 0.003
+"""[s] between two looks for meshes of the simulation."""
 STATE_PERIOD = 0.02
-"""[s] between two looks for changes of the operating state."""
+"""[s] between two looks for changes of the operating state, while the bridge works."""
 CLOCK_STEP = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
 
 class SimulationFollower:
-    """Keeps up with the simulation in a thread of its own, so that decoding a mesh delays no force.
+    """Keeps up with the simulation: its forces in the fast loop; its meshes in a thread beside it,
+    so that decoding one delays no force.
 
     Args:
         node: to subscribe with.
@@ -55,13 +55,10 @@ class SimulationFollower:
 
     Attributes:
         surface: the newest whole one; None before the first.
-        samples: forces that the fast loop has not taken yet, each with the time [ns] at which it
-            would have come if it had not waited anywhere: so old is it, however late it is read.
     """
 
     def __init__(self, node: ManagedNode, on_error: Callable[[str], None]) -> None:
         self.surface: Surface | None = None
-        self.samples: deque[tuple[Sample, int]] = deque(maxlen=4)
         self._on_error = on_error
         self._refusals = node.refusals
         self._follower = MeshFollower(node, node.refusals)
@@ -87,36 +84,41 @@ class SimulationFollower:
         """Why the simulation's forces cannot be trusted at this time [ns], '' if they can."""
         return self._watch.cause(now_ns)
 
-    def run(self, stop: Stop) -> None:
-        """Follows until `stop` is set."""
-        while not stop.is_set():
-            self.poll()
-            time.sleep(FOLLOW_PERIOD)
+    def take_force(self, now_ns: int) -> tuple[Sample | None, int]:
+        """The next force, and since when [ns] it would have been here had it not waited anywhere:
+        so old is it, however late it is read.
 
-    def poll(self) -> None:
-        """Takes what has arrived; what is wrong with one topic keeps none of the others waiting."""
-        for topic, take in ((ros.FORCE, self._take_force), (ros.MESH, self._take_surface)):
-            try:
-                take()
-            except Exception as error:
-                self._refusals.add(topic, error)
-                self._on_error(f'message of the simulation: {error}')
-                self._follower.ask()
-
-    def _take_force(self) -> None:
-        taken = ros.take_numbered(self._force)
-        if taken is None:
-            return
-        sample = self._codec.decode(taken[0])
-        require_frame(ros.FORCE, sample.frame_id)
-        now = time.monotonic_ns()
-        problem = self._watch.see(taken[1], sample.stamp_ns, now)
-        if self._watch.late:
-            self._late += 1
-        else:
-            self.samples.append((sample, now - self._watch.delay))
+        Args:
+            now_ns: monotonic clock [ns].
+        """
+        try:
+            taken = ros.take_numbered(self._force)
+            if taken is None:
+                return None, now_ns
+            sample = self._codec.decode(taken[0])
+            require_frame(ros.FORCE, sample.frame_id)
+            problem = self._watch.see(taken[1], sample.stamp_ns, now_ns)
+        except Exception as error:
+            self._refuse(ros.FORCE, error)
+            return None, now_ns
         if problem:
             self._on_error(problem)
+        if self._watch.late:
+            self._late += 1
+            return None, now_ns
+        return sample, now_ns - self._watch.delay
+
+    def follow_mesh(self) -> None:
+        """Takes what has come of the mesh."""
+        try:
+            self._take_surface()
+        except Exception as error:
+            self._refuse(ros.MESH, error)
+            self._follower.ask()
+
+    def _refuse(self, topic: str, error: Exception) -> None:
+        self._refusals.add(topic, error)
+        self._on_error(f'message of the simulation: {error}')
 
     def _take_surface(self) -> None:
         if self._follower.poll():
@@ -183,17 +185,29 @@ class HapticBridge(ManagedNode):
         self._epoch = time.time_ns() - time.monotonic_ns()
         self._stale_trips = 0
         self._diagnostics = ros.Diagnostics(self, self._collect)
-        self._states = self.create_timer(STATE_PERIOD, self._watch_state)
 
     def work(self, stop: Stop) -> None:
         """Runs the force loop in the calling thread until `stop` is set."""
-        follower = threading.Thread(target=self._follower.run, args=(stop,), daemon=True)
-        follower.start()
+        beside = threading.Thread(target=self._work_beside, args=(stop,), daemon=True)
+        beside.start()
         announce_ready(self)
         self._real_time = prepare()
         self.get_logger().info(self._real_time)
         run_real_time(self._loop, self._tick, stop)
-        follower.join(1.0)
+        beside.join(1.0)
+
+    def _work_beside(self, stop: Stop) -> None:
+        """What a late tick must not wait for. No timer: each turn of rclpy's executor costs more
+        than a tick.
+        """
+        due = 0.0
+        while not stop.is_set():
+            self._follower.follow_mesh()
+            now = time.monotonic()
+            if now >= due:
+                due = now + STATE_PERIOD
+                self._watch_state()
+            time.sleep(FOLLOW_PERIOD)
 
     def rest(self) -> None:
         """Leaves no force behind, and none when it works again: that takes a command."""
@@ -230,8 +244,7 @@ class HapticBridge(ManagedNode):
         now = time.monotonic_ns()
         try:
             pose = self._take_pose(now)
-            samples = self._follower.samples
-            sample, sample_ns = samples.popleft() if samples else (None, now)
+            sample, sample_ns = self._follower.take_force(now)
             tick = self._path.tick(
                 now,
                 state=self._machine.state,

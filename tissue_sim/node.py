@@ -23,7 +23,7 @@ from tissue_sim.refusals import MessageError
 from tissue_sim.replica import MeshReplica
 from tissue_sim.scene_file import read_section
 from tissue_sim.settings import TissueSettings
-from tissue_sim.timing import PeriodicLoop, Turns
+from tissue_sim.timing import PeriodicLoop, Turns, request_preference
 from tissue_sim.tool_contact import tool_contact
 
 _CONTACT_AGE_NS = 100_000_000
@@ -35,6 +35,7 @@ _SUSPICION = 5.0
 _CHECKPOINT_SECONDS = 0.5
 """Between two meshes that go to the checkpoint because of cuts."""
 _CUT_TIMEOUT_NS = 1_000_000_000
+_NICENESS = -10
 _FOUND = 0.5
 """[s] in which a recorder that is there has found a new topic, and subscribed to it."""
 
@@ -124,6 +125,7 @@ class TissueSimNode(ManagedNode):
 
     def work(self, stop: Stop) -> None:
         """Runs frames to the end."""
+        self.get_logger().info(request_preference(_NICENESS))
         self._await_recorder(stop)
         with self._lock:
             self._publish_keyframe()

@@ -162,3 +162,23 @@ def request_real_time(priority: int) -> str:
     except (AttributeError, OSError) as error:
         return f'real-time scheduling is not available here: {error}'
     return f'real-time scheduling granted: SCHED_FIFO, priority {priority}'
+
+
+def request_preference(niceness: int) -> str:
+    """Asks for more turns than other processes for the calling thread, whose work has a deadline
+    but may take a processor for longer than a real-time thread should.
+
+    Args:
+        niceness: below 0.
+
+    Returns:
+        A sentence for the log: what was granted, or why not.
+    """
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, niceness)
+    except PermissionError:
+        return (
+            'no preference over other processes is allowed for this user: allow it with "nice -20" '
+            'in /etc/security/limits.d and log in again'
+        )
+    return f'preferred to other processes: niceness {niceness}'
