@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from session.measure.bench_strokes import LIMIT, Row, Session, array_bytes, measure, ratios
+from session.measure.bench_strokes import Session, array_bytes, measure
+from session.measure.strokes_report import LIMIT, Row, ratios
 from tissue_sim.domains import Domains, NodeDomains, add_still_domains
 from tissue_sim.mesh import TetMesh
 from tissue_sim.tensor_mass import TensorMass, Tensors, add_rows, packed
@@ -15,7 +16,7 @@ STROKES = 30
 def cut() -> tuple[Session, list[Row]]:
     """A small tissue after some strokes; `measure` holds its mesh against what a cut must keep."""
     session = Session(600, seed=3)
-    return session, measure(session, STROKES, 10)
+    return session, list(measure(session, STROKES, 10))
 
 
 def test_many_strokes_leave_a_sound_mesh_and_memory_in_proportion(

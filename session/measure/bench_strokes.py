@@ -9,16 +9,13 @@ counted, and the mesh is held against what a cut must keep.
 import json
 import resource
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from rich import box as borders
 from rich.console import Console
-from rich.table import Table
 
 from cutting.checks import ViolationError, check_mesh, lips, pieces
 from cutting.combined import FOLDED
@@ -29,6 +26,7 @@ from cutting.warm_up import warm_up as warm_up_cutting
 from session.errors import SessionError
 from session.in_process import Tissue
 from session.measure.bench_tissue import SIZE, box, liver_material
+from session.measure.strokes_report import LIMIT, Row, picture, ratios, table
 from session.scene import load_scene
 from session.status import Status
 from tissue_sim.blade import Resistance
@@ -41,9 +39,6 @@ from tissue_sim.simulation import TissueSimulation
 from tissue_sim.topology import OUTER
 from tissue_sim.warm_up import warm_up
 
-LIMIT = 2.0
-"""Frame time by live element and arrays' bytes by live element: the most at the end, over those of
-the beginning."""
 GROWTH = 1.5
 """How far cuts may raise the highest frequency: the step of the whole tissue follows it."""
 _STIFFNESS, _RADIUS, _BLADE = 200.0, 0.004, 0.03
@@ -55,44 +50,6 @@ _REPEATED = 0.3
 _PLACES, _WARM, _FRAMES = 4, 6, 12
 _DEPTH = 1e-3
 """[m] that a palpation goes in: not enough to let the blade in."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """The session after so many strokes.
-
-    Attributes:
-        strokes, tetrahedra, nodes, triangles: how many there are.
-        loose: pieces that no fixed node holds.
-        substeps: of a palpated frame.
-        median, high: processor time of a palpated frame [ms], and its ninetieth percentile.
-        uncut: the same frame of the uncut tissue, measured by turns with it, median [ms].
-        by_element: how much more a live element costs than one of the uncut tissue, median over
-            frame times that were measured one after the other [-].
-        stroke, worst: frames of the strokes since the row before, cutting included, median and
-            largest [ms].
-        arrays: all of tissue and cutting [bytes].
-        resident: memory of the process, the uncut tissue's included [bytes].
-        troubles: frames since the row before that the guard mended or took back.
-        added: mass that the tissue is moved with beyond its own, as a share of it [-].
-    """
-
-    strokes: int
-    tetrahedra: int
-    nodes: int
-    triangles: int
-    loose: int
-    substeps: int
-    median: float
-    high: float
-    uncut: float
-    by_element: float
-    stroke: float
-    worst: float
-    arrays: int
-    resident: int
-    troubles: int
-    added: float
 
 
 class _Noting:
@@ -294,31 +251,25 @@ def array_bytes(root: object) -> int:
     return total
 
 
-def measure(
-    session: Session, strokes: int, every: int, told: Callable[[Row], None] = lambda row: None
-) -> list[Row]:
-    """Cuts, and looks at the session before the first stroke and after every so many.
+def measure(session: Session, strokes: int, every: int) -> Iterator[Row]:
+    """Cuts; gives how the session is before the first stroke and after every so many.
 
     Args:
         session: not cut yet.
         strokes: how many.
         every: so many, a row.
-        told: each row as it comes.
 
     Raises:
         ViolationError: an invariant is broken.
     """
     uncut = session.twin()
-    rows: list[Row] = []
     times: list[float] = []
     for done in range(strokes + 1):
         if done:
             times += session.stroke()
         if done % every == 0 or done == strokes:
-            rows.append(_look(session, uncut, done, times))
-            told(rows[-1])
+            yield _look(session, uncut, done, times)
             times = []
-    return rows
 
 
 def _look(session: Session, uncut: Session, done: int, times: list[float]) -> Row:
@@ -358,7 +309,7 @@ def _resident() -> int:
 def run_strokes(
     output: Path, strokes: int, every: int, size: int, seed: int, growth: float, *, as_json: bool
 ) -> Status:
-    """Measures, prints, and writes the picture and its figures.
+    """Measures, prints, and writes the picture and its figures; after Ctrl-C, of what there is.
 
     Args:
         output: folder; charts/ in it takes the picture.
@@ -375,15 +326,19 @@ def run_strokes(
     warm_up_cutting(CuttingSettings())
     console = Console(soft_wrap=True, highlight=False)
     progress = Console(stderr=True, highlight=False)
-
-    def told(row: Row) -> None:
-        progress.print(f'{row.strokes} of {strokes} strokes, {row.tetrahedra} tetrahedra')
-
     session = Session(size, seed, growth=growth)
+    rows: list[Row] = []
+    interrupted = False
     try:
-        rows = measure(session, strokes, every, told)
+        for row in measure(session, strokes, every):
+            rows.append(row)
+            progress.print(f'{row.strokes} of {strokes} strokes, {row.tetrahedra} tetrahedra')
     except ViolationError as error:
         raise SessionError(f'after stroke {session.strokes}: {error}') from None
+    except KeyboardInterrupt:
+        interrupted = True
+        if not rows:
+            return Status.INTERRUPTED
     folder = output / 'charts'
     folder.mkdir(parents=True, exist_ok=True)
     picture(rows).savefig(folder / 'strokes.png', dpi=110, bbox_inches='tight')
@@ -393,62 +348,11 @@ def run_strokes(
     if as_json:
         console.out(json.dumps(report, indent=2), highlight=False)
     else:
-        console.print(_table(rows))
+        console.print(table(rows))
         console.print(
             f'at the end a live element costs {time_ratio:.2f} times the time and '
             f'{memory_ratio:.2f} times the memory of the beginning; at most {LIMIT:g} is allowed'
         )
+    if interrupted:
+        return Status.INTERRUPTED
     return Status.FAILED if max(time_ratio, memory_ratio) > LIMIT else Status.OK
-
-
-def ratios(rows: list[Row]) -> tuple[float, float]:
-    """Frame time and arrays by live element at the end, over those of the beginning [-]."""
-    first, last = rows[0], rows[-1]
-    arrays = last.arrays / last.tetrahedra / (first.arrays / first.tetrahedra)
-    return last.by_element / first.by_element, arrays
-
-
-def _table(rows: list[Row]) -> Table:
-    table = Table(title='Session of strokes', box=borders.SIMPLE_HEAD, title_justify='left')
-    heads = (
-        'strokes', 'tetrahedra', 'triangles', 'loose', 'substeps', 'frame [ms]', 'p90',
-        'by element', 'stroke [ms]', 'worst', 'arrays [MB]', 'process [MB]', 'troubles',
-    )  # fmt: skip
-    for head in heads:
-        table.add_column(head, justify='right')
-    for row in rows:
-        table.add_row(
-            *(
-                f'{n}'
-                for n in (row.strokes, row.tetrahedra, row.triangles, row.loose, row.substeps)
-            ),
-            *(f'{x:.3g}' for x in (row.median, row.high, row.by_element, row.stroke, row.worst)),
-            *(f'{1e-6 * x:.3g}' for x in (row.arrays, row.resident)),
-            f'{row.troubles}',
-        )
-    return table
-
-
-def picture(rows: list[Row]) -> Figure:
-    """Frame time and memory by live element over the strokes, both over the beginning."""
-    figure = Figure(figsize=(7, 4))
-    axes = figure.add_subplot()
-    strokes, first = [row.strokes for row in rows], rows[0]
-    share = [row.tetrahedra / first.tetrahedra for row in rows]
-    lines = {
-        'frame time by live element': [row.by_element / first.by_element for row in rows],
-        'arrays by live element': [
-            row.arrays / first.arrays / much for row, much in zip(rows, share, strict=True)
-        ],
-        'live elements': share,
-        'substeps a frame': [row.substeps / first.substeps for row in rows],
-    }
-    for name, values in lines.items():
-        axes.plot(strokes, values, marker='o', ms=3, label=name)
-    axes.axhline(LIMIT, color='grey', lw=0.8, ls='--')
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel('strokes')
-    axes.set_ylabel('over the beginning [-]')
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    return figure
