@@ -301,9 +301,9 @@ def held_up(process: int) -> int:
 
 def hears_all(folder: Path) -> bool:
     """Whether messages of all streams come without delay: the first may take a second."""
-    time.sleep(0.1)
+    time.sleep(0.4)  # to read a bag takes the processor from the streams
     age = {m.topic: m.log_time - m.publish_time for m in open_bag(folder).messages()}
-    return all(age.get(f'/{topic}', 1e9) < 5e7 for topic in (MEASURED_CP, CONTACT, MESH_UPDATES))
+    return all(age.get(f'/{topic}', 1e9) < 1e8 for topic in (MEASURED_CP, CONTACT, MESH_UPDATES))
 
 
 def kill_while_it_records(folder: Path, delay: float) -> int:
