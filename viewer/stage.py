@@ -99,7 +99,7 @@ class TissueView:
 
 
 class Stage:
-    """Tool, proxy and force in the scene of a page, and the light on them.
+    """Tool, proxy and force in the scene of a page.
 
     Args:
         server: of the page.
