@@ -1,5 +1,6 @@
 """What a bag says of each simulation frame: its inputs and the force that came of it."""
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ from bags.errors import BagError
 from bags.reader import Bag
 from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, of_session
 from haptic_bridge.wire import ContactCodec, ForceSampleCodec, PoseStampedCodec, Sample
+from tissue_sim.refusals import MessageError
 from tissue_sim.stamps import nanoseconds
 
 NO_ANSWER, APPLIED, EMPTY, REFUSED, LOST, GIVEN_UP = range(6)
@@ -133,9 +135,10 @@ def contact_message(sample: Sample) -> Any:
 def _samples(bag: Bag, topic: str, codec: Any, key: Any, wanted: set[Any]) -> dict[Any, Sample]:
     found = {}
     for recorded in bag.messages([topic]):
-        sample = codec.decode(recorded.data)
-        if key(sample) in wanted:
-            found[key(sample)] = sample
+        with contextlib.suppress(MessageError):  # which no node has used
+            sample = codec.decode(recorded.data)
+            if key(sample) in wanted:
+                found[key(sample)] = sample
     return found
 
 

@@ -9,7 +9,7 @@ from meshes import box
 from tissue_sim.compliance import solve_static
 from tissue_sim.contact import State, ToolContact
 from tissue_sim.contact_stiffness import ContactStiffness, spring_of
-from tissue_sim.coupling import Coupling
+from tissue_sim.coupling import HOLD, PUSH, Coupling
 from tissue_sim.dynamics import Dynamics
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
@@ -19,13 +19,13 @@ UP, REST = np.array([0.0, 0.0, 1.0]), np.zeros(3)
 AT = np.array([0.0265, 0.0225])
 """[m] x and y of the contact, in a triangle of the upper side."""
 FRAME = 1 / 30
+MATERIAL = Material(3000.0, 0.45, 1000.0, 15.0, 1e-4)
 
 
 def tissue() -> Dynamics:
     nodes, tets = box((6, 6, 3), SIZE)
     mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
-    material = Material(3000.0, 0.45, 1000.0, 15.0, 1e-4)
-    return Dynamics(mesh, material, 'linear_smoothed', None, None)
+    return Dynamics(mesh, MATERIAL, 'linear_smoothed', None, None)
 
 
 def touched(mesh: TetMesh, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,6 +102,28 @@ def test_no_contact_however_forged_makes_it_much_stiffer_than_the_coupling(stiff
         assert np.trace(matrix) <= stiffness
         assert matrix[2, 0] != 0
         assert np.abs(matrix).max() <= 4.001 * stiffness
+
+
+@pytest.mark.parametrize('model', ['linear', 'linear_smoothed'])
+def test_a_splinter_that_nothing_holds_has_a_stiffness_between_none_and_the_spring_s(model) -> None:
+    nodes, tets = box((1, 1, 1), SIZE)
+    mesh = TetMesh(nodes[tets[0]], np.arange(4)[None], np.zeros(4, bool))
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        dynamics = Dynamics(mesh, MATERIAL, model, None, None)
+        told = ContactStiffness(dynamics)
+        for _ in range(600):
+            touched = random.choice(4, random.integers(1, 4), replace=False)
+            normal = random.normal(size=3)
+            spring = Coupling(
+                mode=random.choice([PUSH, HOLD]),
+                nodes=touched,
+                weights=random.dirichlet(np.ones(len(touched))),
+                normal=normal / np.linalg.norm(normal),
+                stiffness=SPRING,
+            )
+            sizes = np.linalg.eigvalsh(told.matrix(spring, None, REST, REST))
+            assert -1e-6 * SPRING <= sizes.min() and sizes.max() <= 1.001 * SPRING
 
 
 def told_after(seconds: float, gap: float, speed: float) -> float:

@@ -11,6 +11,8 @@ _AT_MOST = 100_000
 """Conjugate-gradient steps of a static solution: far more than a tissue needs that is held."""
 _SETTLED = 1e-5
 """Residual, relative to the load, at which a compliance is known: its error is of second order."""
+LIMP = 1e6
+"""[m/N] that no tissue reaches: of a piece that nothing holds, in each direction."""
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
@@ -171,7 +173,8 @@ class PointCompliance:
 
         Returns:
             Displacement along axis i for 1 N along axis j [m/N], positive semidefinite,
-            shape (d, d).
+            shape (d, d). A piece that nothing holds has none: the iteration runs away, and is cut
+            off at `LIMP`.
         """
         n = model.mesh.node_count
         if model.mesh.topology != self._topology or self._x.shape != (len(axes), 3 * n):
@@ -205,5 +208,8 @@ class PointCompliance:
             residual[:] = work[0][at]
         x = np.ascontiguousarray(self._x[:, at])
         value = loads @ x.T + x @ residuals.T
+        if not np.isfinite(value).all():
+            self._topology = -1  # what it has come to is no start for the next
+            return LIMP * np.eye(len(axes))
         sizes, vectors = np.linalg.eigh((value + value.T) / 2)
-        return (vectors * np.maximum(sizes, 0.0)) @ vectors.T
+        return (vectors * np.clip(sizes, 0.0, LIMP)) @ vectors.T
