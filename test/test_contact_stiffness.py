@@ -123,7 +123,7 @@ def test_a_splinter_that_nothing_holds_has_a_stiffness_between_none_and_the_spri
                 stiffness=SPRING,
             )
             sizes = np.linalg.eigvalsh(told.matrix(spring, None, REST, REST))
-            assert -1e-6 * SPRING <= sizes.min() and sizes.max() <= 1.001 * SPRING
+            assert sizes.min() >= -1e-6 * SPRING and sizes.max() <= 1.001 * SPRING
 
 
 def told_after(seconds: float, gap: float, speed: float) -> float:

@@ -121,6 +121,13 @@ def test_a_contact_changed_is_caught_in_the_force_of_the_frame_that_it_loaded(
     assert 'differs by' in result.difference.what
 
 
+def test_messages_that_nobody_could_read_are_passed_over(made: Path, tmp_path: Path) -> None:
+    time = next(open_bag(made).messages([CONTACT])).log_time
+    garbage = [(topic, time, bytes(range(96))) for topic in (CONTACT, POSE, FORCE)]
+    result = resimulated(rewritten(made, tmp_path / 'bag', added=garbage), tmp_path)
+    assert result.identical
+
+
 def test_a_force_that_is_not_the_recorded_one_is_caught_and_measured(
     made: Path, tmp_path: Path
 ) -> None:
