@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PERIOD = 0.002
-NOTED, GRAVE = 0.015, 0.100
-"""[s] from which a stand-still explains that a test is late, and that a session is lost."""
+NOTED, GRAVE = 0.015, 0.050
+"""[s] from which a stand-still explains that a test is late, and that a session is lost: after
+30 ms without a command the arm lets go."""
 STOLEN = 0.05
 """Share of the processors' time that explains as much."""
 
