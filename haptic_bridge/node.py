@@ -206,7 +206,10 @@ class HapticBridge(ManagedNode):
             now = time.monotonic()
             if now >= due:
                 due = now + STATE_PERIOD
-                self._watch_state()
+                try:
+                    self._watch_state()
+                except Exception as error:  # nobody else would say it, nor follow the mesh
+                    self._machine.fault(f'the state watch failed: {type(error).__name__}: {error}')
             time.sleep(FOLLOW_PERIOD)
 
     def rest(self) -> None:

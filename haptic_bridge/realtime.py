@@ -46,8 +46,6 @@ def prepare() -> str:
     Returns:
         A sentence for the log about real-time scheduling.
     """
-    gc.collect()
-    gc.freeze()
     gc.disable()
     sys.setswitchinterval(SWITCH_INTERVAL)
     granted = request_real_time(PRIORITY)

@@ -28,6 +28,7 @@ from live import (
     PRESSING,
     ROOT,
     SERVO_CF,
+    STEADY,
     TISSUE_FORCE,
     LiveSession,
     Recording,
@@ -199,6 +200,7 @@ def test_palpation_goes_on_undisturbed_when_the_recorder_dies(
     assert 0 < fault.killed - last < UNWRITTEN
     seen, felt = fault.recording.force(SERVO_CF)
     assert norms[-1] in felt[np.abs(seen - last) < 0.1]
+    assert norms[-1] > PRESSING or last < fault.killed - STEADY  # from before it was pressed
 
 
 def test_force_fades_and_comes_back_when_the_tissue_is_frozen_and_goes_on(

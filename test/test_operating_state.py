@@ -1,5 +1,8 @@
 """Claims about CRTK's state machine."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 import rclpy
 from hypothesis import given
@@ -15,6 +18,7 @@ from haptic_bridge.operating_state import (
     device_cause,
 )
 from session.domain import reserved_domain
+from tissue_sim.lifecycle import Stop
 
 D, E, P, F = State.DISABLED, State.ENABLED, State.PAUSED, State.FAULT
 INVALID = True
@@ -147,9 +151,9 @@ def test_a_device_in_any_state_but_enabled_or_not_homed_is_a_cause(state):
     assert 'not ENABLED' in device_cause(state, is_homed=True)
 
 
-def test_a_bridge_that_was_stopped_before_its_start_does_not_enable_itself(
-    tmp_path, monkeypatch: pytest.MonkeyPatch
-):
+@pytest.fixture
+def bridge(tmp_path: Path) -> Iterator[HapticBridge]:
+    """The node, configured, with its own enabling still to come."""
     scene = tmp_path / 'scene.yaml'
     scene.write_text('device: {profile: emulated}\n')
     with reserved_domain('free') as domain:
@@ -160,14 +164,31 @@ def test_a_bridge_that_was_stopped_before_its_start_does_not_enable_itself(
     node = HapticBridge()
     try:
         node.configure()
-        monkeypatch.setattr(node._path, 'is_fresh', lambda now_ns: True)
-        monkeypatch.setattr(node._machine, '_cause', str)
-        node._machine.command(E_STOP)
-        node._watch_state()
-        assert (node._machine.state, node._machine.reason) == (F, 'emergency stop')
-        node._machine.command('disable')  # a person's
-        node._watch_state()
-        assert node._machine.state is E
+        yield node
     finally:
         node.destroy_node()
         rclpy.shutdown()
+
+
+def test_a_bridge_that_was_stopped_before_its_start_does_not_enable_itself(
+    bridge: HapticBridge, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(bridge._path, 'is_fresh', lambda now_ns: True)
+    monkeypatch.setattr(bridge._machine, '_cause', str)
+    bridge._machine.command(E_STOP)
+    bridge._watch_state()
+    assert (bridge._machine.state, bridge._machine.reason) == (F, 'emergency stop')
+    bridge._machine.command('disable')  # a person's
+    bridge._watch_state()
+    assert bridge._machine.state is E
+
+
+def test_a_bridge_whose_state_watch_fails_is_in_fault_and_follows_the_mesh(
+    bridge: HapticBridge, monkeypatch: pytest.MonkeyPatch
+):
+    followed = []
+    monkeypatch.setattr(bridge._follower, 'follow_mesh', lambda: followed.append(True))
+    monkeypatch.setattr(bridge, '_watch_state', lambda: 1 / 0)
+    bridge._work_beside(Stop(lambda: len(followed) > 5))
+    assert bridge._machine.state is F
+    assert 'the state watch failed: ZeroDivisionError' in bridge._machine.reason
