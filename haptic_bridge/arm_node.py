@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Joy
 
 from haptic_bridge.arm import EmulatedArm
@@ -17,6 +16,7 @@ from haptic_bridge.convention import DeviceConvention
 from haptic_bridge.crtk import StateInterface
 from haptic_bridge.hand import Hand, compile_script
 from haptic_bridge.operating_state import OperatingStateMachine, State, crtk_types
+from haptic_bridge.orientation import from_quaternion, quaternion
 from haptic_bridge.realtime import prepare, run_real_time
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.stream_watch import StreamWatch
@@ -207,9 +207,8 @@ class ArmNode(ManagedNode):
         except MessageError as error:
             self.refusals.add(HAND, error)
             return
-        to_device = Rotation.from_matrix(self._frame.rotation()).inv()
-        orientation = (to_device * Rotation.from_quat(turn)).as_quat()
-        self._arm.guide(self._frame.to_device(position), orientation)
+        turned = self._frame.rotation().T @ from_quaternion(turn)
+        self._arm.guide(self._frame.to_device(position), quaternion(turned))
 
     def _bridge_state(self, message: Any) -> None:
         self._bridge_enabled = message.state == State.ENABLED

@@ -2,8 +2,10 @@
 
 from typing import Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
+from haptic_bridge.orientation import from_quaternion, from_rpy
 from tissue_sim.scene_file import SceneModel
 
 Vector = tuple[float, float, float]
@@ -28,6 +30,12 @@ class PoseSettings(SceneModel):
             if abs(norm - 1) > 1e-3:
                 raise ValueError(f'quaternion has length {norm:.4g}: it must be 1')
         return self
+
+    def rotation(self) -> np.ndarray | None:
+        """Of the tool, shape (3, 3), or None where none is given."""
+        if self.quaternion is not None:
+            return from_quaternion(self.quaternion)
+        return None if self.rpy_deg is None else from_rpy(self.rpy_deg)
 
 
 class Waypoint(PoseSettings):

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.spatial.transform import Rotation
 
 from haptic_bridge.arm_settings import HandSettings, Phase, PoseSettings, ScriptSettings
+from haptic_bridge.orientation import quaternion
 from haptic_bridge.settings import SettingsError, Transform
 
 _FASTEST = 2.0
@@ -111,15 +111,12 @@ def _check_speed(durations: np.ndarray, positions: np.ndarray) -> None:
 
 
 def _orientations(poses: list[PoseSettings], tissue_from_device: Transform) -> np.ndarray:
-    to_device = Rotation.from_matrix(tissue_from_device.rotation()).inv()
-    current = Rotation.identity()
+    to_device, current = tissue_from_device.rotation().T, np.eye(3)
     quaternions = np.empty((len(poses), 4))
     for i, pose in enumerate(poses):
-        if pose.quaternion is not None:
-            current = Rotation.from_quat(pose.quaternion)
-        elif pose.rpy_deg is not None:
-            current = Rotation.from_euler('xyz', pose.rpy_deg, degrees=True)
-        quaternions[i] = (to_device * current).as_quat()
+        turned = pose.rotation()
+        current = current if turned is None else turned
+        quaternions[i] = quaternion(to_device @ current)
         if i and quaternions[i] @ quaternions[i - 1] < 0:
             quaternions[i] *= -1
     return quaternions

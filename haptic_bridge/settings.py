@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
-from scipy.spatial.transform import Rotation
 
+from haptic_bridge.orientation import from_rpy
 from tissue_sim.scene_file import SceneModel, nearest, syntax_error
 from tissue_sim.share import share_folder
 
@@ -52,7 +52,7 @@ class Transform(SceneModel):
 
     def rotation(self) -> np.ndarray:
         """Rotation of vectors from the device frame to the tissue frame, shape (3, 3)."""
-        return Rotation.from_euler('xyz', self.rotation_rpy_deg, degrees=True).as_matrix()
+        return from_rpy(self.rotation_rpy_deg)
 
     def to_tissue(self, positions: np.ndarray) -> np.ndarray:
         """Maps device positions [m], shape (..., 3), to the tissue frame."""

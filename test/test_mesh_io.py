@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from meshes import box, irregular_box
 
 from tissue_sim.errors import MeshError
-from tissue_sim.mesh_checks import EDGES, check_mesh, quality, select_fixed
+from tissue_sim.mesh_checks import EDGES, _coincident, check_mesh, quality, select_fixed
 from tissue_sim.mesh_io import load_mesh, load_tissue
 from tissue_sim.settings import FixedRegion, Material, TissueSettings
 
@@ -369,3 +369,15 @@ def test_quality_of_a_corner_tetrahedron_is_the_textbooks():
     assert measured.radius_ratio[0] == pytest.approx(3 * inradius / circumradius)
     assert measured.dihedral[0] == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))))
     assert measured.altitude[0] == pytest.approx(1 / np.sqrt(3))
+
+
+@given(st.integers(2, 12), st.integers(0, 2**32 - 1), st.booleans())
+def test_nodes_that_coincide_are_found_however_many_lie_in_a_plane(side, seed, regular):
+    source = np.random.default_rng(seed)
+    places = np.indices((side,) * 3).reshape(3, -1).T / side
+    nodes = places if regular else source.random((side**3, 3))
+    again = source.integers(0, len(nodes), 4)
+    nodes = np.concatenate([nodes, nodes[again] + source.uniform(-6e-10, 6e-10, (4, 3))])
+    distances = np.linalg.norm(nodes[:, None] - nodes[None], axis=2)
+    wanted = np.argwhere(np.triu(distances <= 1e-9, 1))
+    assert set(map(tuple, _coincident(nodes, 1e-9).tolist())) == set(map(tuple, wanted.tolist()))

@@ -5,16 +5,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from meshes import box
+from numpy.testing import assert_allclose
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 from strokes import draw, mesh_of, method_named, straight
 from visualization_msgs.msg import Marker, MarkerArray
 
 from haptic_bridge.chain import TOUCHING
-from haptic_bridge.settings import DeviceSettings
+from haptic_bridge.settings import DeviceSettings, ToolSettings, Vector
 from tissue_sim.messages import mesh_message
 from tissue_sim.replica import MeshReplica
 from tissue_sim.ros import LATCHED, STATIC_FRAMES
@@ -22,7 +24,7 @@ from viewer import frames
 from viewer.frames import StaticFrames, device_frame, publishing_command
 from viewer.markers import Colouring, Markers, shades, von_mises
 from viewer.moment import Moment
-from viewer.stage import METRES_A_NEWTON, OPENED
+from viewer.stage import METRES_A_NEWTON, OPENED, blade, handle
 
 LARGEST = 0.004
 STAMP = 12_000_000_034
@@ -214,3 +216,27 @@ def test_without_tf2_msgs_the_viewer_says_what_publishes_the_frame(monkeypatch):
         **{'--qx': '0', '--qy': '0', '--qz': '0', '--qw': '1'},
         **{'--frame-id': 'tissue', '--child-frame-id': 'arm_base'},
     }
+
+
+@pytest.mark.parametrize(
+    ('root', 'tip'),
+    [
+        ((0.0, 0.0, 0.02), (0.0, 0.0, -0.004)),
+        ((0.01, 0.0, 0.0), (-0.02, 0.003, 0.0)),
+        ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ],
+)
+def test_blade_and_handle_are_closed_solids_with_their_faces_outward(
+    root: Vector, tip: Vector
+) -> None:
+    tool = ToolSettings(blade_root=root, blade_tip=tip)
+    for corners, triangles in (blade(tool), handle(tool)):
+        solid = trimesh.Trimesh(corners, triangles)
+        assert solid.is_volume
+        assert solid.is_convex
+        assert solid.volume > 0
+    length = float(np.linalg.norm(np.subtract(root, tip)))
+    mean = length - 0.005 * 2 / 3  # of its three edges: the spine's two end earlier
+    assert trimesh.Trimesh(*blade(tool)).volume == pytest.approx(0.005 * 0.0008 / 2 * mean)
+    middle = np.array(root) + 0.035 * np.subtract(root, tip) / length
+    assert_allclose(trimesh.Trimesh(*handle(tool)).center_mass, middle, atol=1e-9)

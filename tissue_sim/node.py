@@ -53,6 +53,9 @@ class TissueSimNode(ManagedNode):
         text = 'go on with the tissue as its followers know it, in the place of a node that died'
         self._resumes = bool(parameter(self, 'resume', False, text))
         settings = read_section(scene, 'tissue', TissueSettings)
+        # First, so that a recorder finds it while the tissue is made.
+        self._inputs = self.create_publisher(FrameInputs, ros.FRAME_INPUTS, ros.STREAM)
+        self._announced = time.monotonic()
         self._scene = scene.stem
         text = 'file in which the tissue is kept, for the node that takes the place of this one'
         file = str(parameter(self, 'checkpoint', '', text))
@@ -116,7 +119,6 @@ class TissueSimNode(ManagedNode):
         self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, ros.LATCHED)
         self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
         self._forces = self.create_publisher(ForceSample, ros.FORCE, ros.STREAM)
-        self._inputs = self.create_publisher(FrameInputs, ros.FRAME_INPUTS, ros.STREAM)
         self._contacts = ros.polled(self, Contact, ros.CONTACT, ros.NEWEST_BEST_EFFORT)
         self._cutting = self.create_client(Cut, ros.CUT)
         service = self.create_service(GetMesh, ros.GET_MESH, self._serve_mesh)
@@ -141,7 +143,7 @@ class TissueSimNode(ManagedNode):
 
     def _await_recorder(self, stop: Stop) -> None:
         """Lets a recorder find the inputs of frames: only a whole record is computed again."""
-        until = time.monotonic() + _FOUND
+        until = self._announced + _FOUND
         while self._inputs.get_subscription_count() == 0 and time.monotonic() < until:
             if stop.is_set():
                 return

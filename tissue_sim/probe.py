@@ -2,17 +2,20 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tissue_sim.dent import Dents, dents
 from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.errors import MeshError
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh
 from tissue_sim.press import Press, places, settlement
 from tissue_sim.refine import refined
+
+if TYPE_CHECKING:
+    from tissue_sim.dent import Dents
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +56,9 @@ class Strains:
         return self._dents.error(rotating) if self._dents else float('inf')
 
     @cached_property
-    def _dents(self) -> Dents | None:
+    def _dents(self) -> 'Dents | None':
+        from tissue_sim.dent import dents  # and scipy's sparse matrices, which few scenes need
+
         try:
             return dents(self.mesh, self.material, self.press, self.depth)
         except MeshError:

@@ -4,8 +4,8 @@ import time
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
-from scipy.spatial.transform import Rotation
 
+from haptic_bridge.orientation import quaternion
 from haptic_bridge.settings import DeviceSettings
 from tissue_sim.ros import ARM, FRAME, LATCHED, STATIC_FRAMES, stamp
 
@@ -31,8 +31,7 @@ def device_frame(device: DeviceSettings, name: str = DEVICE_FRAME) -> TransformS
     message.header.frame_id = FRAME
     to, turn = message.transform.translation, message.transform.rotation
     to.x, to.y, to.z = map(float, frame.translation)
-    quaternion = Rotation.from_matrix(frame.rotation()).as_quat()
-    turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
+    turn.x, turn.y, turn.z, turn.w = map(float, quaternion(frame.rotation()))
     return message
 
 

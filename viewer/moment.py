@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from haptic_bridge.convention import DeviceConvention
+from haptic_bridge.orientation import from_quaternion, quaternion
 from haptic_bridge.settings import DeviceSettings
 from haptic_bridge.wire import ContactCodec, Sample, WrenchStampedCodec
 
@@ -42,7 +42,7 @@ class Translator:
 
     def __init__(self, device: DeviceSettings) -> None:
         self._convention = DeviceConvention(device)
-        self._to_tissue = Rotation.from_matrix(device.tissue_from_device.rotation())
+        self._to_tissue = device.tissue_from_device.rotation()
         self._body = device.force_frame == 'body'
 
     def moment(self, contact: Sample, pose: Sample | None, wrench: Sample | None) -> Moment:
@@ -57,16 +57,16 @@ class Translator:
         def get(name: str) -> Floats:
             return np.array(contact.values[ContactCodec.fields[name]], float)
 
-        turned = Rotation.identity()
+        turned = np.eye(3)
         if pose is not None:
-            turned = Rotation.from_quat(self._convention.pose(pose).values[3:])
+            turned = from_quaternion(self._convention.pose(pose).values[3:])
         force = np.zeros(3)
         if wrench is not None:
             felt = self._convention.force(wrench.values)[WrenchStampedCodec.fields['force']]
-            force = self._to_tissue.apply(turned.apply(felt) if self._body else felt)
+            force = self._to_tissue @ (turned @ felt if self._body else felt)
         return Moment(
             tip=get('device'),
-            turn=(self._to_tissue * turned).as_quat(scalar_first=True),
+            turn=np.roll(quaternion(self._to_tissue @ turned), 1),
             blade=np.stack([get('blade_root'), get('blade_tip')]),
             proxy=get('proxy'),
             contact=int(get('state')[0]),

@@ -3,13 +3,15 @@
 from typing import Any
 
 import numpy as np
-import trimesh
+from numpy.typing import NDArray
 
 from haptic_bridge.chain import INSIDE
 from haptic_bridge.settings import ToolSettings
 from tissue_sim.replica import MeshReplica
 from viewer.moment import Floats, Moment
 from viewer.surfaces import CUT, OUTER, DrawnTissue, Surface
+
+Indices = NDArray[np.int64]
 
 TISSUE, OPENED, OTHER_TISSUE = (205, 118, 100), (120, 8, 22), (120, 140, 190)
 BLADE, HANDLE, PROXY, FORCE = (178, 186, 196), (52, 60, 72), (40, 150, 90), (30, 90, 220)
@@ -21,8 +23,10 @@ _LEAST_VIEW = 0.12
 """[m] that are in view, however small the tissue: the tool has its own size."""
 _LEAST_FORCE = 0.02
 """[N] below which no arrow is drawn."""
-_SPINE, _THICKNESS, _HANDLE = 0.005, 0.0008, 0.07
-"""[m] Width and thickness of the blade as drawn, length of the handle."""
+_SPINE, _THICKNESS = 0.005, 0.0008
+"""[m] Width and thickness of the blade as drawn."""
+_HANDLE, _RADIUS, _SIDES = 0.07, 0.0035, 24
+"""[m] Length and radius of the handle as drawn; its sides."""
 _NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
 _LIP, _LIFT = 0.0010, 0.0004
 """[m] Width of the line along the lips of a cut, and how far it is above them: by it alone is seen
@@ -134,8 +138,7 @@ class Stage:
             ('blade', blade(tool), BLADE),
             ('handle', handle(tool), HANDLE),
         ):
-            vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-            scene.add_mesh_simple(f'/tool/{name}', vertices, faces, color=colour, flat_shading=True)
+            scene.add_mesh_simple(f'/tool/{name}', *mesh, color=colour, flat_shading=True)
         self._proxy.scale = tool.radius
 
     def look_at(self, tissue: MeshReplica, *, beside: bool = False) -> None:
@@ -180,24 +183,45 @@ def arrow(moment: Moment) -> Floats:
     return np.stack([moment.tip, moment.tip + METRES_A_NEWTON * moment.force])[None]
 
 
-def blade(tool: ToolSettings) -> Any:
-    """The blade, in the tool frame: its edge from root to tip, its spine behind it."""
+def blade(tool: ToolSettings) -> tuple[Floats, Indices]:
+    """The blade, in the tool frame: its edge from root to tip, its spine behind it.
+
+    Returns:
+        corners [m], shape (n, 3), and triangles, shape (m, 3).
+    """
     root, tip = np.array(tool.blade_root), np.array(tool.blade_tip)
-    along = (tip - root) / np.linalg.norm(tip - root)
+    along, back, side = _axes(tool)
+    shoulder = tip - along * _SPINE
+    behind = np.stack([back * _SPINE + side * by for by in (-_THICKNESS / 2, _THICKNESS / 2)])
+    return _loft(np.stack([root, *root + behind]), np.stack([tip, *shoulder + behind]))
+
+
+def handle(tool: ToolSettings) -> tuple[Floats, Indices]:
+    """The handle, in the tool frame, behind the blade's root: a cylinder.
+
+    Returns:
+        As `blade`.
+    """
+    along, back, side = _axes(tool)
+    angles = np.linspace(0.0, 2 * np.pi, _SIDES, endpoint=False)[:, None]
+    end = tool.blade_root + _RADIUS * (np.cos(angles) * back + np.sin(angles) * side)
+    return _loft(end - along * _HANDLE, end)
+
+
+def _axes(tool: ToolSettings) -> Floats:
+    """Unit vectors along the edge to the tip, to the spine, and across, shape (3, 3)."""
+    along = np.subtract(tool.blade_tip, tool.blade_root)
+    along /= np.linalg.norm(along)
     back = -np.eye(3)[int(np.argmin(np.abs(along)))]  # it cuts along +x where it can
     back -= along * (back @ along)
     back /= np.linalg.norm(back)
-    side = np.cross(along, back) * _THICKNESS / 2
-    shoulder = tip - along * _SPINE
-    spine = np.stack([root, shoulder]) + back * _SPINE
-    edge = np.stack([root, tip])
-    return trimesh.convex.convex_hull(np.concatenate([edge, spine + side, spine - side]))
+    return np.stack([along, back, np.cross(along, back)])
 
 
-def handle(tool: ToolSettings) -> Any:
-    """The handle, in the tool frame, behind the blade's root."""
-    root, tip = np.array(tool.blade_root), np.array(tool.blade_tip)
-    along = (root - tip) / np.linalg.norm(root - tip)
-    return trimesh.creation.cylinder(
-        radius=0.0035, segment=np.stack([root, root + along * _HANDLE]), sections=24
-    )
+def _loft(first: Floats, second: Floats) -> tuple[Floats, Indices]:
+    """The solid between two convex polygons that turn to the right on the way to the second."""
+    n = len(first)
+    at, then = np.arange(n), np.roll(np.arange(n), -1)
+    sides = [np.stack([at, then, then + n], axis=1), np.stack([at, then + n, at + n], axis=1)]
+    fan = np.stack([np.zeros(n - 2, int), at[1:-1], at[2:]], axis=1)
+    return np.concatenate([first, second]), np.concatenate([*sides, fan[:, ::-1], fan + n])

@@ -16,9 +16,10 @@ from rich.table import Table
 from session.errors import SessionError
 from session.measure.bench_clock import Figure, by_turns, figure, stream
 from session.measure.bench_cut import cut
-from session.measure.bench_flow import codec, session, start
+from session.measure.bench_flow import codec, session
 from session.measure.bench_frame import frame
 from session.measure.bench_proxy import proxy
+from session.measure.bench_start import start
 from session.measure.bench_tissue import force, step
 from session.options import Bench
 

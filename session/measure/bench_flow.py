@@ -1,8 +1,5 @@
-"""What messages cost, a session as a whole, and the start of a node."""
+"""What messages cost, and a session as a whole."""
 
-import json
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -109,38 +106,3 @@ def session(sizes: list[int], seconds: float = 2.0) -> list[Figure]:
             figure(f'  tick without a frame, {label}', 'us', 1e6 * np.sort(spent)[: ticks // 2]),
         ]
     return figures
-
-
-_START = """
-import json, sys, time
-def now(): return time.monotonic()
-t = [now()]
-import tissue_sim.node, cutting.node, haptic_bridge.node
-t.append(now())
-from tissue_sim.warm_up import warm_up
-warm_up()
-t.append(now())
-from session.scene import load_scene
-from tissue_sim.assembly import make_simulation
-make_simulation(load_scene('liver').tissue)
-t.append(now())
-print(json.dumps([b - a for a, b in zip(t, t[1:])]))
-"""
-
-
-def start(repeats: int = 3) -> list[Figure]:
-    """A new process that becomes a tissue: wall-clock time, kernels from their cache."""
-    rows = []
-    for _ in range(repeats + 1):
-        began = time.monotonic()
-        done = subprocess.run(
-            [sys.executable, '-c', _START], capture_output=True, text=True, check=True
-        )
-        rows.append([time.monotonic() - began, *json.loads(done.stdout.splitlines()[-1])])
-    times = np.array(rows[1:])  # the first may compile
-    names = ('whole process', '  imports of the nodes', '  kernels', '  the tissue of liver')
-    total = float(np.median(times[:, 0]))
-    return [
-        figure(name, 's', column, float(np.median(column)) / total, names[0])
-        for name, column in zip(names, times.T, strict=True)
-    ]

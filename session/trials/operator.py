@@ -11,10 +11,10 @@ from cutting_trainer_msgs.msg import ForceSample, MeshDelta
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from scipy.spatial.transform import Rotation
 from std_msgs.msg import String
 
 from haptic_bridge.operating_state import State, crtk_types
+from haptic_bridge.orientation import quaternion
 from haptic_bridge.wire import WrenchStampedCodec
 from session.graph import BRIDGE_NODE
 from session.scene import Scene
@@ -54,7 +54,8 @@ class Operator:
         script = scene.arm.script
         points = [w.position for phase in script.phases for w in phase.waypoints]
         self._path = np.array([script.start.position, *points])
-        self._turn = Rotation.from_euler('xyz', script.start.rpy_deg, degrees=True).as_quat()
+        turned = script.start.rotation()
+        self._turn = quaternion(np.eye(3) if turned is None else turned)
         self._random = np.random.default_rng(seed)
         self._began = time.monotonic()
         self._round, self._shift = -1, np.zeros(3)

@@ -1,0 +1,62 @@
+"""How long a node takes from the start of its process until it says that it is ready."""
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from session.domain import reserved_domain
+from session.errors import SessionError
+from session.graph import MODULES, RECORDER_NODE, node_command, node_environment, recorder_command
+from session.measure.bench_clock import Figure, figure
+from session.node_process import NodeCommand
+from tissue_sim.share import share_folder
+
+_REFERENCE = 'Python with numba'
+
+
+def start(repeats: int = 5) -> list[Figure]:
+    """Each node by itself, alone in its domain, kernels from their cache: wall-clock time.
+
+    Raises:
+        SessionError: a node did not become ready.
+    """
+    scene = share_folder() / 'config' / 'scenes' / 'liver.yaml'
+    times: dict[str, list[float]] = {_REFERENCE: [], **{name: [] for name in MODULES}}
+    with reserved_domain('free') as domain, tempfile.TemporaryDirectory() as folder:
+        for number in range(repeats + 1):
+            began = time.monotonic()
+            subprocess.run([sys.executable, '-c', 'import numba'], check=True)
+            times[_REFERENCE].append(time.monotonic() - began)
+            for name in MODULES:
+                if name == RECORDER_NODE:
+                    command = recorder_command(scene, Path(folder, f'bag{number}'), 0)
+                else:
+                    command = node_command(name, {'scene': str(scene)})
+                times[name].append(_until_ready(command, node_environment(domain)))
+    base = float(np.median(times[_REFERENCE][1:]))  # the first may compile
+    return [
+        figure(name, 's', np.array(took[1:]), float(np.median(took[1:])) / base, _REFERENCE)
+        for name, took in times.items()
+    ]
+
+
+def _until_ready(command: NodeCommand, environment: dict[str, str]) -> float:
+    began = time.monotonic()
+    process = subprocess.Popen(
+        command.argv, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert process.stdout is not None
+    said = []
+    for line in process.stdout:
+        said.append(line.strip())
+        if line.startswith(f'ready: {command.name}'):
+            took = time.monotonic() - began
+            process.terminate()
+            process.communicate(timeout=command.grace)
+            return took
+    process.wait()
+    raise SessionError(f'{command.name} did not become ready: {" / ".join(said[-3:])}')
