@@ -72,6 +72,19 @@ def test_a_bridge_that_holds_a_dead_simulation_s_force_is_found() -> None:
     assert unsafe(forceless(seen, 4.15, 10.0, 'commanded'), [fault], PROFILE) == []
 
 
+def test_a_force_that_is_heard_before_the_word_that_it_follows_is_not_held() -> None:
+    seen = without(steady(), 4.0, 6.0, 'samples')  # the next one: at 6.0 s
+    fault = Fault('freeze', 'tissue_sim', 4.0, 5.95)
+
+    def held(seen: Witnessed) -> bool:
+        return any('held' in found for found in unsafe(seen, [fault], PROFILE))
+
+    assert not held(forceless(seen, 4.15, 5.995, 'commanded'))
+    assert held(forceless(seen, 4.15, 5.98, 'commanded'))
+    # The listener stood still, and then heard all at once.
+    assert not held(without(forceless(seen, 4.15, 5.96, 'commanded'), 5.9, 5.96, 'commanded'))
+
+
 def test_a_simulation_that_is_asked_to_end_may_finish_and_no_force_outlives_its_last_word() -> None:
     seen = without(steady(), 4.25, 7.0, 'samples')  # its last one: at 4.233 s
     fault = Fault('end', 'tissue_sim', 4.0, 7.0)
@@ -79,6 +92,7 @@ def test_a_simulation_that_is_asked_to_end_may_finish_and_no_force_outlives_its_
     (found,) = unsafe(forceless(seen, 4.42, 10.0, 'commanded'), [fault], PROFILE)
     assert 'the bridge held 1 N more than 150 ms after the end of tissue_sim' in found
     killed = Fault('kill', 'tissue_sim', 4.0, 7.0)  # and said nothing more
+    seen = without(steady(), 4.01, 7.0, 'samples')
     assert unsafe(forceless(seen, 4.35, 10.0, 'commanded'), [killed], PROFILE)
 
 

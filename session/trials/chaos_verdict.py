@@ -150,7 +150,9 @@ def _let_go(
         last = word
     again = min(source[source > last + deadline], default=np.inf)
     late = _standstill(rows, fault.began, again)
-    window = (rows[:, 0] > last + deadline + late) & (rows[:, 0] < again)
+    # Whoever commands by the first word after it may be heard before that word.
+    early = _standstill(rows, again - 0.1, again)
+    window = (rows[:, 0] > last + deadline + late) & (rows[:, 0] < again - early)
     if (_norms(rows[window]) > NO_FORCE).any():
         worst = _norms(rows[window]).max()
         yield (
