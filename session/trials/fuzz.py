@@ -46,8 +46,8 @@ SETTLE = 1.0
 """[s] after the last message before which nothing counts as after it."""
 MOST_RECORDED = 1 << 22
 """[bytes] of a message that is recorded, so that there are larger ones."""
-LONGEST = 3600.0
-"""[s] of it all."""
+LONGEST, LONGEST_EACH = 600.0, 0.02
+"""[s] of it all, and for each message beside that."""
 CHANGES = {'cutting.method': 'combined'}
 """Of the scene: cuts that remove no tissue, so that there is some left to cut in the end."""
 
@@ -200,7 +200,7 @@ def run_fuzz(options: FuzzOptions) -> Status:
             if not supervisor.start():
                 return not_run(supervisor.end(), bag, notes)
             course = Course(options, scene, domain, supervisor)
-            supervisor.run(LONGEST, tick=course.tick)
+            supervisor.run(LONGEST + LONGEST_EACH * options.messages, tick=course.tick)
             course.end()
             outcome = supervisor.end()
     for name, node in course.watch.nodes.items():

@@ -12,8 +12,9 @@ GROWTH = 1.5
 ALLOWANCE = 150.0
 """[MB] that a node may have beside that; and the largest message for each topic that it hears:
 Fast DDS keeps a buffer as large as the largest one that a reader has had."""
-SILENCE = 10.0
-"""[s] without a word on /diagnostics after which a node hangs."""
+SILENCE = 30.0
+"""[s] without a word on /diagnostics after which a node hangs; less may be one that gets no turn:
+fuzzer and force loops want two processors for themselves."""
 STANDSTILL = 2.0
 """[s] between two periods of a node's loop after which it has stood still."""
 _STAMPED = re.compile(r'\[(\d+)\.\d+\]|^\d{4}-\d\d-\d\d (\d\d:\d\d:\d\d)')
