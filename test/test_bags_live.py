@@ -9,93 +9,39 @@ import resource
 import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import rclpy
 import yaml
 from cutting_trainer_msgs.msg import Contact, MeshDelta
 from geometry_msgs.msg import PoseStamped
-from rclpy.executors import SingleThreadedExecutor
+from live import PATIENCE, ROOT, wait_for
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rclpy.serialization import serialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
+from recording import DOMAIN, RecorderProcess, source
 from rosbags.highlevel import AnyReader
-from std_msgs.msg import Header, String
+from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from bags.node import Recorder
 from bags.reader import open_bag
 from bags.repair import repair_bag
 from session.scene import find_scene
-from tissue_sim.ros import ARM, CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
+from tissue_sim.ros import CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
 
 pytestmark = pytest.mark.real_time
-
-ROOT = Path(__file__).parents[1]
-DOMAIN = 20 + os.getpid() % 80
-PATIENCE = 60.0
-MEASURED_CP = f'{ARM}/measured_cp'
-
-
-def wait_for(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, f'waited in vain for {what}'
-        time.sleep(0.01)
 
 
 @pytest.fixture
 def node() -> Iterator[Node]:
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    node = Node('source', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    stop = threading.Event()
-
-    def spin() -> None:
-        while not stop.is_set():
-            executor.spin_once(timeout_sec=0.05)
-
-    spinner = threading.Thread(target=spin)
-    spinner.start()
-    yield node
-    stop.set()
-    spinner.join()
-    node.destroy_node()
-    rclpy.shutdown(context=context)
-
-
-class RecorderProcess:
-    """A recorder of its own process, ready to hear."""
-
-    def __init__(self, folder: Path, **parameters: object) -> None:
-        self.folder = folder
-        settings = [f'{key}:={value}' for key, value in ({'bag': folder} | parameters).items()]
-        self.process = subprocess.Popen(
-            [sys.executable, '-m', 'bags.node', '--ros-args']
-            + [word for setting in settings for word in ('-p', setting)],
-            cwd=ROOT,
-            env=os.environ | {'ROS_DOMAIN_ID': str(DOMAIN), 'PYTHONUNBUFFERED': '1'},
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == 'ready: recorder\n'
-
-    def end(self, number: int = signal.SIGINT) -> str:
-        """Sends a signal; returns what the recorder said after it was ready."""
-        self.process.send_signal(number)
-        said, _ = self.process.communicate(timeout=PATIENCE)
-        return said
+    with source() as node:
+        yield node
 
 
 @pytest.fixture
@@ -250,105 +196,6 @@ def test_service_calls_are_recorded_where_introspection_is_on(
     assert [event.request[0].data for event in events if event.request] == [True]
     assert [event.response[0].message for event in events if event.response] == ['cut']
     assert len(recorded(recorder.folder, '/do_it/_service_event')) == len(events) == 2
-
-
-class Streams(threading.Thread):
-    """Publishes on three topics, two at 1 kHz and the mesh at 30 Hz, and keeps what it sent, when.
-
-    Attributes:
-        sent: time [ns since the epoch] and bytes of each message, by topic.
-    """
-
-    def __init__(self, node: Node) -> None:
-        super().__init__()
-        self.sent: dict[str, list[tuple[int, bytes]]] = {}
-        self._publishers = [
-            (node.create_publisher(PoseStamped, f'/{MEASURED_CP}', QoSProfile(depth=1000)), 1),
-            (node.create_publisher(Contact, f'/{CONTACT}', QoSProfile(depth=1000)), 1),
-            (node.create_publisher(MeshDelta, f'/{MESH_UPDATES}', UPDATES), 33),
-        ]
-        self._ended = threading.Event()
-
-    def run(self) -> None:
-        displacement = [random.Random(2).random() for _ in range(3000)]
-        kinds: list[Callable[[int], Any]] = [
-            lambda i: PoseStamped(header=Header(frame_id=f'device {i}')),
-            lambda i: Contact(sequence=i),
-            lambda i: MeshDelta(revision=i, displacement=displacement),
-        ]
-        deadline = time.monotonic()
-        for i in itertools.count():
-            for (publisher, every), make in zip(self._publishers, kinds, strict=True):
-                if i % every == 0:
-                    data = serialize_message(make(i))
-                    self.sent.setdefault(publisher.topic, []).append((time.time_ns(), data))
-                    publisher.publish(data)
-            deadline += 0.001
-            time.sleep(max(0.0, deadline - time.monotonic()))
-            if self._ended.is_set():
-                return
-
-    def end(self) -> None:
-        self._ended.set()
-        self.join()
-
-
-def held_up(process: int) -> int:
-    """How long [ns] the threads of a process have waited for a processor since they began."""
-    tasks = Path(f'/proc/{process}/task').iterdir()
-    return sum(int((task / 'schedstat').read_text().split()[1]) for task in tasks)
-
-
-def hears_all(folder: Path) -> bool:
-    """Whether messages of all streams come without delay: the first may take a second."""
-    time.sleep(0.4)  # to read a bag takes the processor from the streams
-    age = {m.topic: m.log_time - m.publish_time for m in open_bag(folder).messages()}
-    return all(age.get(f'/{topic}', 1e9) < 1e8 for topic in (MEASURED_CP, CONTACT, MESH_UPDATES))
-
-
-def kill_while_it_records(folder: Path, delay: float) -> int:
-    """Starts a recorder, and kills it some time [s] after its first messages.
-
-    Returns:
-        When [ns since the epoch], less the time for which it had no processor while it recorded.
-    """
-    recorder = RecorderProcess(folder, seed=11)
-    try:
-        before = held_up(recorder.process.pid)
-        wait_for(lambda: hears_all(folder), 'the recorder to hear all')
-        time.sleep(delay)
-        return time.time_ns() - (held_up(recorder.process.pid) - before)
-    finally:
-        recorder.process.kill()
-        recorder.process.communicate()
-
-
-def test_a_recorder_killed_twenty_times_leaves_all_but_the_last_half_second_bit_for_bit(
-    node: Node, tmp_path: Path
-) -> None:
-    source, streams = random.Random(4), Streams(node)
-    streams.start()
-    folders = [tmp_path / f'bag{i}' for i in range(20)]
-    delays = [source.uniform(0.0, 0.6) for _ in folders]
-    try:
-        with ThreadPoolExecutor(2) as several:
-            killed = list(several.map(kill_while_it_records, folders, delays))
-    finally:
-        streams.end()
-    for folder, end in zip(folders, killed, strict=True):
-        assert not open_bag(folder).complete
-        assert not repair_bag(folder).whole
-        bag = open_bag(folder)
-        assert bag.complete and bag.custom_data['seed'] == '11'
-        for topic, sent in streams.sent.items():
-            times, all_sent = zip(*sent, strict=True)
-            kept = [m.data for m in bag.messages([topic])]
-            # A process that waits for a processor may lose some on the way: counted elsewhere.
-            place = {data: i for i, data in enumerate(all_sent)}
-            places = [place[data] for data in kept]
-            assert places == sorted(set(places))
-            missing = times[places[-1] + 1 :]
-            assert not missing or missing[0] > end - 5e8
 
 
 def test_what_a_publisher_sent_before_the_recorder_heard_it_is_said(

@@ -43,7 +43,7 @@ def test_it():
 def suite(folder: Path, text: str, **values: object) -> 'subprocess.CompletedProcess[str]':
     """Runs a file of tests as those of this folder are, on a machine that is quiet for them."""
     (folder / 'test_it.py').write_text(text.format(**values))
-    for name in ('conftest.py', 'stand_still.py'):
+    for name in ('conftest.py', 'repetition.py', 'stand_still.py'):
         text = (ROOT / 'test' / name).read_text()
         for said, instead in (
             ('PERIOD + NOTED', '60.0'),
