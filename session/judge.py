@@ -13,6 +13,8 @@ REPORTED = 5.0
 """Length [s] from which a session has reports of the rates after its first second; of a shorter one
 they are not judged."""
 ERROR_LEVEL = 2
+STOOD_STILL = 0.02
+"""[s] between two turns of a loop of 1 kHz after which a bridge takes its device for silent."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ def judge(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
         *outcome.troubles,
         *_bag(summary),
         *_errors(summary),
+        *_held_up(summary, expected),
         *([] if outcome.interrupted else _rates(summary, outcome, expected)),
         *([] if outcome.interrupted else _touch(summary, outcome, expected)),
     ]
@@ -77,6 +80,18 @@ def _errors(summary: Summary) -> list[str]:
         f'{node.name} reported an error: {node.message}'
         for node in summary.nodes.values()
         if node.worst_level == ERROR_LEVEL
+    ]
+
+
+def _held_up(summary: Summary, expected: Expected) -> list[str]:
+    """What explains an error: loops that got no turn."""
+    if not _errors(summary):
+        return []
+    return [
+        f'{node.name} got no turn for {1e3 * node.longest_period:.0f} ms: the machine is busy, or '
+        'its host takes the processor away; see ./trainer doctor, then try again'
+        for node in summary.nodes.values()
+        if 1 / expected.rates.get(node.name, 1.0) < STOOD_STILL < node.longest_period
     ]
 
 

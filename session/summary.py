@@ -30,6 +30,7 @@ class NodeSummary:
         within, lowest_within: share of periods within half a period of the nominal one.
         period_p99, worst_period_p99: [s].
         lateness_p999: worst of the reports [s].
+        longest_period: between two turns of its loop, from the beginning on [s].
         missed: deadlines.
         real_time: what it said about real-time scheduling, empty if nothing.
         worst_level: of its statuses, 0 OK to 3 STALE.
@@ -44,6 +45,7 @@ class NodeSummary:
     period_p99: float
     worst_period_p99: float
     lateness_p999: float
+    longest_period: float
     missed: float
     real_time: str
     worst_level: int
@@ -137,6 +139,7 @@ def _node(name: str, statuses: Iterable[Status], settled: float) -> NodeSummary:
     def values(key: str) -> list[float]:
         return [v for s in late if not math.isnan(v := s.number(key))] or [math.nan]
 
+    periods = [v for s in own if not math.isnan(v := s.number('period_max'))]
     before = [status.number('missed') for status in own if status.time <= settled]
     return NodeSummary(
         name=name,
@@ -147,6 +150,7 @@ def _node(name: str, statuses: Iterable[Status], settled: float) -> NodeSummary:
         period_p99=statistics.median(values('period_p99')),
         worst_period_p99=max(values('period_p99')),
         lateness_p999=max(values('lateness_p999')),
+        longest_period=max(periods, default=math.nan),
         missed=values('missed')[-1] - (before[-1] if before else 0.0),
         real_time=own[-1].values.get('real_time', ''),
         worst_level=worst.level,

@@ -183,6 +183,17 @@ def test_error_on_diagnostics_is_told_and_a_warning_is_not() -> None:
     assert failures == ['haptic_bridge reported an error: no pose for 20 ms']
 
 
+def test_a_loop_that_got_no_turn_explains_an_error_and_is_none_by_itself() -> None:
+    evidence = session()
+    evidence.statuses.append(status('haptic_bridge', 8.0, period_max=0.033))
+    evidence.statuses.append(status('tissue_sim', 8.0, period_max=0.05))
+    assert judge(summarise(evidence), FINISHED, EXPECTED) == []
+    evidence.statuses.append(status('haptic_bridge', 9.0, 2, 'no pose for 20 ms'))
+    error, why = judge(summarise(evidence), FINISHED, EXPECTED)
+    assert 'no pose' in error
+    assert 'haptic_bridge got no turn for 33 ms' in why
+
+
 def test_deaths_come_first_with_signal_and_time(good: Summary) -> None:
     death = Death('cutting', -signal.SIGKILL, 12.34, ())
     outcome = dataclasses.replace(FINISHED, deaths=[death])
