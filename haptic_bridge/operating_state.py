@@ -5,6 +5,8 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Any, NamedTuple
 
+from tissue_sim.refusals import quoted
+
 
 class State(StrEnum):
     """CRTK's four states."""
@@ -83,7 +85,7 @@ class OperatingStateMachine:
             return ''
         if name not in COMMANDS:
             known = ', '.join((*COMMANDS, E_STOP))
-            return f'unknown state command {name!r}: use one of {known}'
+            return f'unknown state command {quoted(name)}: use one of {known}'
         with self._lock:
             if name in ('home', 'unhome'):
                 homed = name == 'home'

@@ -114,6 +114,14 @@ def test_one_unsafe_command_is_found(force: float, said: str) -> None:
     assert any(said in found for found in unsafe(seen, [], PROFILE))
 
 
+def test_motors_that_anybody_commands_may_give_what_they_have() -> None:
+    seen = steady()
+    seen.felt[5000] = (5.0, 5.0, 1.2 * PROFILE.max_force, 0.0, 0.0)
+    assert unsafe(seen, [], PROFILE)
+    assert unsafe(seen, [], PROFILE, 1.2 * PROFILE.max_force) == []
+    assert unsafe(seen, [], PROFILE, 1.1 * PROFILE.max_force)
+
+
 def test_a_tissue_that_closes_again_and_a_node_that_stays_away_are_found() -> None:
     seen = steady()
     seen.topologies[100] = (3.3, 2)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from meshes import irregular_box
 
+from haptic_bridge.operating_state import OperatingStateMachine
 from haptic_bridge.wire import (
     LONGEST_FRAME,
     ContactCodec,
@@ -20,6 +21,7 @@ from haptic_bridge.wire import (
 from tissue_sim.errors import MeshError
 from tissue_sim.mesh import TetMesh
 from tissue_sim.refusals import (
+    LONGEST_DETAIL,
     LONGEST_SAID,
     MOST_REASONS,
     OTHERS,
@@ -242,3 +244,12 @@ def test_counts_and_lines_are_bounded_whatever_comes() -> None:
     assert re.fullmatch(r'[ -~]+', said)
     assert len(said) < LONGEST_SAID + 400
     assert refusals.news() == ''
+
+
+def test_what_is_said_of_a_message_is_short_however_long_its_strings_are() -> None:
+    with pytest.raises(MessageError, match='10000000 characters') as found:
+        require_frame('tissue/mesh', 10_000_000 * 'x')
+    assert len(str(found.value)) < LONGEST_DETAIL + 100
+    assert len(str(MessageError('no such message', 10_000_000 * 'x'))) < LONGEST_DETAIL + 100
+    machine = OperatingStateMachine()
+    assert len(machine.command(1_000_000 * 'x')) < LONGEST_DETAIL

@@ -8,6 +8,9 @@ MOST_SAID = 4
 """Reasons in one line of the log."""
 LONGEST_SAID = 160
 """Characters of the newest sentence in it: it may quote the message."""
+LONGEST_DETAIL, LONGEST_QUOTED = 300, 60
+"""Characters of what is said of one message, and of what is quoted out of it: a frame_id may have
+a hundred megabytes, and a reason goes to the log, /diagnostics and operating states."""
 OTHERS = 'others'
 TISSUE_FRAME = 'tissue'
 
@@ -17,11 +20,11 @@ class MessageError(ValueError):
 
     Args:
         reason: a short fixed phrase, without numbers: it is what is counted by.
-        detail: which value is wrong, and what would be right.
+        detail: which value is wrong, and what would be right; cut off at `LONGEST_DETAIL`.
     """
 
     def __init__(self, reason: str, detail: str = '') -> None:
-        super().__init__(f'{reason}: {detail}' if detail else reason)
+        super().__init__(f'{reason}: {detail[:LONGEST_DETAIL]}' if detail else reason)
         self.reason = reason
 
 
@@ -50,7 +53,7 @@ class Refusals:
         if key not in self._counts and len(self._counts) >= MOST_REASONS:
             key = OTHERS
         self._counts[key] += 1
-        self._newest = str(why)
+        self._newest = str(why)[:LONGEST_SAID]
 
     def values(self) -> dict[str, object]:
         """For /diagnostics: `refused TOPIC: REASON` and how often."""
@@ -65,8 +68,15 @@ class Refusals:
         told = [f'{key} ({count} times)' for key, count in since.most_common(MOST_SAID)]
         if len(since) > MOST_SAID:
             told.append(f'{len(since) - MOST_SAID} other reasons')
-        newest = self._newest[:LONGEST_SAID].encode('unicode_escape').decode()
+        newest = self._newest.encode('unicode_escape').decode()
         return f'refused {"; ".join(told)}; the last one: {newest}'
+
+
+def quoted(text: str) -> str:
+    """A string of a message in quotes, no more of it than a sentence needs."""
+    if len(text) <= LONGEST_QUOTED:
+        return repr(text)
+    return f'{text[:LONGEST_QUOTED]!r}... ({len(text)} characters)'
 
 
 def require_frame(topic: str, frame: str) -> None:
@@ -76,5 +86,5 @@ def require_frame(topic: str, frame: str) -> None:
         MessageError: it is in another.
     """
     if frame != TISSUE_FRAME:
-        text = f'{topic} has the frame_id {frame!r}, but forces are felt in {TISSUE_FRAME!r}'
+        text = f'{topic} has the frame_id {quoted(frame)}, but forces are felt in {TISSUE_FRAME!r}'
         raise MessageError('wrong frame', text)

@@ -60,18 +60,25 @@ class Witnessed:
     topologies: list[tuple[float, int]] = field(default_factory=list)
 
 
-def unsafe(seen: Witnessed, faults: Sequence[Fault], profile: DeviceProfile) -> list[str]:
+def unsafe(
+    seen: Witnessed,
+    faults: Sequence[Fault],
+    profile: DeviceProfile,
+    most_felt: float | None = None,
+) -> list[str]:
     """What was not safe for the hand.
 
     Args:
         seen: of the session.
         faults: in the order of their beginning.
         profile: of the device: its limits.
+        most_felt: what its motors have [N], where others than the bridge may command them; None: it
+            is commanded by the bridge alone, and its limit holds.
     """
     commanded, felt = _rows(seen.commanded), _rows(seen.felt)
     return [
-        *_limits('servo_cf', commanded, profile),
-        *_limits('measured_cf', felt, profile),
+        *_limits('servo_cf', commanded, profile.max_force),
+        *_limits('measured_cf', felt, most_felt or profile.max_force),
         *_slew(commanded, profile),
         *(s for fault in faults for s in _let_go(fault, seen, commanded, felt)),
         *_unasked(seen, faults, commanded),
@@ -104,13 +111,13 @@ def _norms(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(rows[:, 2:], axis=1))
 
 
-def _limits(topic: str, rows: np.ndarray, profile: DeviceProfile) -> list[str]:
+def _limits(topic: str, rows: np.ndarray, most: float) -> list[str]:
     found = []
     if not np.isfinite(rows[:, 2:]).all():
         found.append(f'{topic} had a force that is not finite')
     worst = float(_norms(rows).max(initial=0.0))
-    if worst > profile.max_force * (1 + 1e-9):
-        found.append(f'{topic} had {worst:.3g} N, above the {profile.max_force:g} N of the device')
+    if worst > most * (1 + 1e-9):
+        found.append(f'{topic} had {worst:.3g} N, above the {most:g} N of the device')
     return found
 
 

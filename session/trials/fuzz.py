@@ -135,7 +135,7 @@ class Course:
         said = [] if self.afterwards else ['the hand did not press and cut after the last one']
         return [
             *([self.fuzzer.problem] if self.fuzzer.problem else []),
-            *unsafe(seen, [], scene.device.load_profile()),
+            *unsafe(seen, [], scene.device.load_profile(), scene.arm.max_force),
             *self.watch.problems,
             *(f for name in sorted(self.watch.nodes) for f in self._of_node(name, now)),
             *said,
