@@ -1,10 +1,9 @@
 """What a cut must keep (docs/cutting.md), as checks for tests and for `trainer fuzz-cuts`."""
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tissue_sim.mesh import TetMesh
+from tissue_sim.mesh_checks import components
 from tissue_sim.topology import CUT, FACE_NODES
 
 
@@ -112,8 +111,7 @@ def corner_groups(tets: np.ndarray, across: np.ndarray) -> np.ndarray:
             ones.append(4 * tet[same] + i)
             twos.append(4 * other[same] + j)
     one, two = np.concatenate(ones), np.concatenate(twos)
-    graph = coo_array((np.ones(len(one)), (one, two)), shape=(4 * len(tets),) * 2)
-    return connected_components(graph, directed=False)[1]
+    return components(4 * len(tets), np.stack([one, two], axis=1))[1]
 
 
 def _check_pinches(tets: np.ndarray, across: np.ndarray, nodes: int) -> None:
@@ -165,6 +163,4 @@ def pieces(mesh: TetMesh) -> np.ndarray:
     """Which face-connected piece each tetrahedron belongs to, shape (m,)."""
     tet, face = np.nonzero(mesh.neighbors >= 0)
     other = mesh.neighbors[tet, face] // 4
-    m = len(mesh.tetrahedra)
-    graph = coo_array((np.ones(len(tet)), (tet, other)), shape=(m, m))
-    return connected_components(graph, directed=False)[1]
+    return components(len(mesh.tetrahedra), np.stack([tet, other], axis=1))[1]

@@ -99,7 +99,7 @@ def select_fixed(
             f'tissue.fixed holds all {len(nodes)} nodes: {span}; make the regions smaller'
         )
     ends = tetrahedra[:, EDGES].reshape(-1, 2)
-    count, part = _components(len(nodes), ends)
+    count, part = components(len(nodes), ends)
     held = np.zeros(count, bool)
     held[part[fixed]] = True
     if not held.all():
@@ -295,7 +295,7 @@ def _check_pinches(nodes: Nodes, tetrahedra: Tetrahedra, pairs: NDArray[np.intp]
                     ]
                 )
             )
-        _, star = _components(count * len(subsets), np.concatenate(links))
+        _, star = components(count * len(subsets), np.concatenate(links))
         _, first_of_star = np.unique(star, return_index=True)
         simplices = keys.reshape(-1, size)[first_of_star]
         found, stars = np.unique(simplices, axis=0, return_counts=True)
@@ -310,8 +310,8 @@ def _check_pinches(nodes: Nodes, tetrahedra: Tetrahedra, pairs: NDArray[np.intp]
             )
 
 
-def _components(count: int, links: NDArray[np.integer]) -> tuple[int, NDArray[np.int64]]:
-    """How many parts so many items are by their links, shape (k, 2), and whose each is."""
+def components(count: int, links: NDArray[np.integer]) -> tuple[int, NDArray[np.int64]]:
+    """How many parts so many items are by their links, shape (k, 2), and the part of each, (n,)."""
     label = np.empty(count, np.int64)
     return _join(links.astype(np.int64), label), label
 
