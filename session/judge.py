@@ -90,8 +90,10 @@ def _held_up(summary: Summary, expected: Expected) -> list[str]:
     return [
         f'{node.name} got no turn for {1e3 * node.longest_period:.0f} ms: the machine is busy, or '
         'its host takes the processor away; see ./trainer doctor, then try again'
-        for node in summary.nodes.values()
-        if 1 / expected.rates.get(node.name, 1.0) < STOOD_STILL < node.longest_period
+        for name, rate in expected.rates.items()
+        if rate * STOOD_STILL > 1
+        and (node := summary.nodes.get(name))
+        and node.longest_period > STOOD_STILL
     ]
 
 
