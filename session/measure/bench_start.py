@@ -13,6 +13,7 @@ from session.errors import SessionError
 from session.graph import MODULES, RECORDER_NODE, node_command, node_environment, recorder_command
 from session.measure.bench_clock import Figure, figure
 from session.node_process import NodeCommand
+from session.processes import Supervisor
 from tissue_sim.share import share_folder
 
 _REFERENCE = 'Python with numba'
@@ -27,6 +28,7 @@ def start(repeats: int = 5) -> list[Figure]:
     scene = share_folder() / 'config' / 'scenes' / 'liver.yaml'
     times: dict[str, list[float]] = {_REFERENCE: [], **{name: [] for name in MODULES}}
     with reserved_domain('free') as domain, tempfile.TemporaryDirectory() as folder:
+        environment, log = node_environment(domain), Path(folder, 'log')
         for number in range(repeats + 1):
             began = time.monotonic()
             subprocess.run([sys.executable, '-c', 'import numba'], check=True)
@@ -36,7 +38,7 @@ def start(repeats: int = 5) -> list[Figure]:
                     command = recorder_command(scene, Path(folder, f'bag{number}'), 0)
                 else:
                     command = node_command(name, {'scene': str(scene)})
-                times[name].append(_until_ready(command, node_environment(domain)))
+                times[name].append(_until_ready(command, log, environment))
     base = float(np.median(times[_REFERENCE][1:]))  # the first may compile
     return [
         figure(name, 's', np.array(took[1:]), float(np.median(took[1:])) / base, _REFERENCE)
@@ -44,19 +46,12 @@ def start(repeats: int = 5) -> list[Figure]:
     ]
 
 
-def _until_ready(command: NodeCommand, environment: dict[str, str]) -> float:
+def _until_ready(command: NodeCommand, log: Path, environment: dict[str, str]) -> float:
     began = time.monotonic()
-    process = subprocess.Popen(
-        command.argv, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    assert process.stdout is not None
-    said = []
-    for line in process.stdout:
-        said.append(line.strip())
-        if line.startswith(f'ready: {command.name}'):
-            took = time.monotonic() - began
-            process.terminate()
-            process.communicate(timeout=command.grace)
-            return took
-    process.wait()
-    raise SessionError(f'{command.name} did not become ready: {" / ".join(said[-3:])}')
+    with Supervisor([command], log, environment) as supervisor:
+        ready = supervisor.start()
+        took = time.monotonic() - began
+        outcome = supervisor.end()
+    if not ready:
+        raise SessionError('; '.join(outcome.troubles))
+    return took
