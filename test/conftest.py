@@ -14,6 +14,8 @@ from hypothesis import settings
 from repetition import SUITE, Run, judged, left_running
 from stand_still import Watch
 
+from session.graph import discovery
+
 # How long an example takes is a matter of the machine, and of what it must compile first.
 settings.register_profile('trainer', deadline=None)
 settings.load_profile('trainer')
@@ -38,8 +40,10 @@ def pytest_configure(config: pytest.Config) -> None:
     """Starts to watch the processors, and sees to it that an interrupt is one.
 
     Whoever starts the suite in the background of a shell script has it ignore SIGINT, and every
-    process that it starts with it.
+    process that it starts with it. Nodes of the tests find others as those of a session do: with
+    shared memory, a process that is killed would stop those that talked to it, for seconds.
     """
+    os.environ.update(discovery(os.environ))
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     folder = Path(tempfile.mkdtemp(prefix='stand-still-'))

@@ -36,7 +36,7 @@ class Streams(threading.Thread):
     """Publishes on three topics, two at 1 kHz and the mesh at 30 Hz, and keeps what it sent, when.
 
     Attributes:
-        sent: time [ns since the epoch] and bytes of each message, by topic.
+        sent: time [ns since the epoch] at which it was out, and bytes of each message, by topic.
     """
 
     def __init__(self, node: Node) -> None:
@@ -61,8 +61,8 @@ class Streams(threading.Thread):
             for (publisher, every), make in zip(self._publishers, kinds, strict=True):
                 if i % every == 0:
                     data = serialize_message(make(i))
-                    self.sent.setdefault(publisher.topic, []).append((time.time_ns(), data))
                     publisher.publish(data)
+                    self.sent.setdefault(publisher.topic, []).append((time.time_ns(), data))
             deadline += 0.001
             time.sleep(max(0.0, deadline - time.monotonic()))
             if self._ended.is_set():
