@@ -376,7 +376,8 @@ def test_installed_trainer_finds_scenes_devices_and_profiles(tmp_path: Path) -> 
         'print(demo.SESSIONS.resolve())\n'
     )
     environ = os.environ | {'PYTHONPATH': str(site)}
-    environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
+    for variable in (RANGE, PROFILES):
+        environ.pop(variable, None)
     done = subprocess.run(
         [sys.executable, '-c', code],
         cwd=tmp_path,
