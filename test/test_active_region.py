@@ -131,3 +131,18 @@ def test_a_product_at_some_nodes_is_bit_for_bit_that_of_all(model: ModelName) ->
     x = np.random.default_rng(0).standard_normal((mesh.node_count, 3))
     some = np.array([3, 40, 41, 77])
     np.testing.assert_array_equal(elastic.product(x, some), elastic.product(x)[some])
+
+
+def test_a_frame_of_many_substeps_does_not_choose_its_nodes_more_often() -> None:
+    nodes, tets = box(CELLS, SIZE)
+    mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
+    material = Material(5000.0, 0.4, 1000.0, 20.0, 2e-3)
+    region = Dynamics(mesh, material, active=ActiveSettings('budget', mesh.node_count))._active
+    choices = []
+    for substeps in (40, 200, 900):
+        done = count = 0
+        while done < substeps:
+            done += region.ahead(substeps - done, substeps, 1.0)
+            count += 1
+        choices.append(count)
+    assert choices == [3, 6, 6]

@@ -18,9 +18,10 @@ from tissue_sim.mesh import grown
 from tissue_sim.rings import intervals, without
 
 _BLOCK = 4
-"""Substeps between two choices while some nodes sleep."""
-_BLOCK_AWAKE = 16
-"""The same while none does, or as many move as may: a new choice would change little."""
+"""Substeps between two choices while some nodes sleep, where no cut has shortened them."""
+_BLOCK_AWAKE, _CHOICES_AWAKE = 16, 6
+"""While none sleeps, or as many move as may, a new choice would change little: substeps between two
+at least, and how many a frame has at most. A choice costs as much as some four substeps."""
 _RINGS = 2
 """Neighbours of neighbours that a moving node keeps awake."""
 _PATIENCE = 6
@@ -98,6 +99,11 @@ class ActiveRegion:
         self._scratch = np.zeros((2, 0))
 
     @property
+    def nodes(self) -> np.ndarray:
+        """The nodes that move, sorted, shape (a,)."""
+        return self._awake
+
+    @property
     def count(self) -> int:
         """How many nodes move."""
         return len(self._awake)
@@ -116,8 +122,13 @@ class ActiveRegion:
         self._moved[:] = False
         return out
 
-    def ahead(self, left: int) -> int:
-        """Substeps until the next choice, of some that are left in the frame."""
+    def ahead(self, left: int, total: int, shortened: float) -> int:
+        """Substeps until the next choice.
+
+        Args:
+            left, total: substeps that the frame still has, and has in all.
+            shortened: length of a substep where nothing was cut over its length now.
+        """
         if self._settings.mode == 'off':
             return left
         if self._implicit:
@@ -125,7 +136,9 @@ class ActiveRegion:
         most = self._model.mesh.node_count
         if self._settings.mode == 'budget':
             most = min(most, self._settings.nodes)
-        return min(_BLOCK_AWAKE if self.count >= most else _BLOCK, left)
+        if self.count >= most:
+            return min(max(_BLOCK_AWAKE, -(-total // _CHOICES_AWAKE)), left)
+        return min(max(_BLOCK, int(_BLOCK * shortened)), left)
 
     def choose(
         self,

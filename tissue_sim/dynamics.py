@@ -101,6 +101,7 @@ class Dynamics:
         self._inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / self.model.mass), 3)
         self._inertia = self.model.mass.copy()
         self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
+        self._uncut = self._frequency.omega
         self._bounds: dict[float, float] = {}
         self._still = 0
         self._elastic = ElasticState(self.model)
@@ -254,7 +255,7 @@ class Dynamics:
                 coupling,
                 self._frame_time,
             )
-            steps = self._active.ahead(substeps - done)
+            steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
             work += self._integrator.step(
                 region.operands,
                 self.inverse_mass,
@@ -346,8 +347,10 @@ class Dynamics:
         return self._elastic.renewed(self.displacement, changed[changed < n])
 
     def _kinetic_energy(self) -> float:
-        v = self.velocity
-        return 0.5 * float(self._inertia[: len(v)] @ np.square(v).sum(axis=1))
+        v, inertia = self.velocity, self._inertia[: self.mesh.node_count]
+        if not self._active.whole:  # the others are at rest
+            v, inertia = v[self._active.nodes], inertia[self._active.nodes]
+        return 0.5 * float(inertia @ np.square(v).sum(axis=1))
 
     def _follow_cut(self, nodes: np.ndarray) -> None:
         """Brings what is kept by node up to date where a cut touched it, nodes of shape (r,)."""

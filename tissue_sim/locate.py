@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit
 
 _INSIDE = -1e-9
+_FARTHER = 1.0 + 1e-9
 
 
 @njit(cache=True)
@@ -139,11 +140,7 @@ def distance_to_triangles(point, positions, triangles):
         positions: nodes [m], shape (n, 3).
         triangles: nodes of each, shape (k, 3).
     """
-    best = np.inf
-    for k in range(len(triangles)):
-        a, b, c = positions[triangles[k, 0]], positions[triangles[k, 1]], positions[triangles[k, 2]]
-        best = min(best, _squared_distance(point, a, b, c))
-    return np.sqrt(best)
+    return np.sqrt(_closest(point, positions, triangles)[0])
 
 
 @njit(cache=True)
@@ -155,13 +152,29 @@ def closest_triangle(point, positions, triangles):
         positions: [m], shape (n, 3).
         triangles: shape (k, 3), one at least.
     """
+    return _closest(point, positions, triangles)[1]
+
+
+@njit(cache=True)
+def _closest(point, positions, triangles):
+    """Least squared distance, and the first triangle that has it; 0 of no triangles.
+
+    What lies in a box farther away than another triangle is not looked at: rounding apart, for
+    which there is `_FARTHER`, its distance is no smaller than that of the box.
+    """
     least, found = np.inf, 0
     for i in range(len(triangles)):
         a, b, c = triangles[i]
-        distance = _squared_distance(point, positions[a], positions[b], positions[c])
-        if distance < least:
-            least, found = distance, i
-    return found
+        away = 0.0
+        for axis in range(3):
+            x, y, z = positions[a, axis], positions[b, axis], positions[c, axis]
+            gap = max(min(x, y, z) - point[axis], point[axis] - max(x, y, z), 0.0)
+            away += gap * gap
+        if away <= _FARTHER * least:
+            distance = _squared_distance(point, positions[a], positions[b], positions[c])
+            if distance < least:
+                least, found = distance, i
+    return least, found
 
 
 @njit(cache=True)
