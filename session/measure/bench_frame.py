@@ -67,7 +67,11 @@ class _Load:
             liver_material(),
             Resistance(tissue.cut_threshold if cut else 10.0, m.toughness, m.blade_friction),
             model='linear',
-            stepping=TimeStepping('symplectic_euler', max_substeps=2000),
+            stepping=TimeStepping(
+                'symplectic_euler',
+                max_substeps=2000,
+                frequency_growth=tissue.integration.frequency_growth,
+            ),
             active=ActiveSettings('budget', nodes) if nodes else ActiveSettings(),
         )
         some = f'{nodes} nodes move' if nodes else 'all nodes move'
