@@ -11,6 +11,7 @@ from test_blade import contact_at
 from cutting.methods import make_method
 from cutting.settings import CuttingSettings
 from tissue_sim.blade import Resistance, Sweep
+from tissue_sim.coupling import PUSH, Coupling
 from tissue_sim.dynamics import Dynamics, TimeStepping
 from tissue_sim.elasticity import MODELS, ModelName
 from tissue_sim.guard import Guard
@@ -211,3 +212,29 @@ def test_energy_from_nowhere_is_found_before_it_is_large() -> None:
     assert guard.trouble(u, 1.2e-4, 0.5e-4) == ''
     u[0] = np.nan
     assert 'farther' in guard.trouble(u, np.nan, 0.0)
+
+
+def test_a_loose_piece_that_is_pushed_away_stops_and_the_rest_goes_on() -> None:
+    rest, tets = box((4, 4, 2), 0.01)
+    piece, others = box((1, 1, 1), 0.01)
+    nodes = np.concatenate([rest, piece + np.array([0.0, 0.0, 0.03])])
+    mesh = TetMesh(nodes, np.concatenate([tets, others + len(rest)]), nodes[:, 2] < 1e-9)
+    dynamics = Dynamics(mesh, Material(5000.0, 0.4, 1000.0, 5.0, 1e-3))
+    size, free = float(np.linalg.norm(np.ptp(nodes, axis=0))), np.arange(len(rest), len(nodes))
+    dynamics.velocity[free, 0] = 2.0
+    dynamics.restart()
+    corner = np.array([np.argmax(rest.sum(axis=1))])
+    troubles, depth, count = [], 0.0, 0
+    for k in range(40):
+        before, here = (rest[corner[0]] - [0, 0, 1e-4 * j] for j in (k, k + 1))
+        motion = dynamics.advance(Coupling(PUSH, corner, np.ones(1), before, here, stiffness=200.0))
+        assert not motion.diverged
+        troubles.append(motion.trouble)
+        count += motion.substeps
+        assert dynamics.displacement[corner[0], 2] < depth
+        depth = dynamics.displacement[corner[0], 2]
+    said = [trouble for trouble in troubles if trouble]
+    assert len(said) == 1 and 'a piece that nothing held' in said[0]
+    assert 0.5 * size < dynamics.displacement[free].max() < size
+    assert not dynamics.velocity[free].any()
+    assert count == 40 * motion.substeps

@@ -200,6 +200,9 @@ class Dynamics:
     def advance(self, coupling: Coupling) -> Motion:
         """Moves the tissue by a frame; a frame that diverges is tried again with shorter steps.
 
+        A piece that nothing holds may be pushed away for ever: one that has come as far as the
+        tissue is long stays there.
+
         Args:
             coupling: the tool's spring.
         """
@@ -219,6 +222,9 @@ class Dynamics:
             found = self._guard.trouble(self.displacement, energy, work)
             if not found:
                 return motion
+            if self._hold_lost(*before):
+                trouble = f'{found}: a piece that nothing held, which stays there from now on'
+                continue
             trouble = trouble or f'{found}: {self._cause(coupling, dt)}'
             self._u, self._v = before[0].copy(), before[1].copy()
             if self._caution * _FINER > _FINEST:
@@ -232,6 +238,24 @@ class Dynamics:
         force, elastic = self._elastic.whole(self.displacement)
         self._guard.open(elastic)
         return Motion(np.zeros_like(force), 0.0, 0.0, substeps, 0.0, trouble, diverged=True)
+
+    def _hold_lost(self, u: np.ndarray, v: np.ndarray) -> bool:
+        """Goes back to the start of the frame without the loose pieces that went too far in it.
+
+        Args:
+            u, v: displacement [m] and velocity [m/s] at the start; v is changed.
+
+        Returns:
+            Whether there were any.
+        """
+        n = self.mesh.node_count
+        lost = self._guard.lost(u[: 3 * n].reshape(-1, 3), self.displacement)
+        if len(lost) == 0:
+            return False
+        v[: 3 * n].reshape(-1, 3)[lost] = 0.0
+        self.inverse_mass.reshape(-1, 3)[lost] = 0.0
+        self._u, self._v = u.copy(), v.copy()
+        return True
 
     def _integrate(self, coupling: Coupling, dt: float, substeps: int) -> float:
         size = 3 * self.mesh.node_count

@@ -3,6 +3,7 @@
 import numpy as np
 
 from tissue_sim.mesh import TetMesh, tetrahedron_volumes
+from tissue_sim.mesh_checks import components
 
 TOOL_SPEED = 3.0
 """[m/s] above which a tool has not moved but jumped; hands come to 2."""
@@ -59,6 +60,31 @@ class Guard:
         self._account = min(account, energy)
         self._peak = max(_MEMORY * self._peak, self._account)
         return ''
+
+    def lost(self, before: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Nodes of loose pieces that have been pushed so far that the frame is trouble.
+
+        Nothing brings such a piece back: other steps are of no help, and every frame that follows
+        would be trouble too.
+
+        Args:
+            before, u: displacement before and after the frame [m], shape (n, 3).
+
+        Returns:
+            Sorted, shape (k,); none where a node of tissue that is held has moved too far, or the
+            piece was not half as far before: then it is the step that is to blame.
+        """
+        gone, mesh = ~(np.abs(u) < self._size).all(axis=1), self._mesh
+        none = np.zeros(0, np.int64)
+        if not gone.any() or not mesh.fixed.any():
+            return none
+        links = np.concatenate([mesh.tetrahedra[:, [0, k]] for k in (1, 2, 3)])
+        piece = components(mesh.node_count, links)[1]
+        far = np.unique(piece[gone])
+        on_the_way = piece[(np.abs(before) > self._size / 2).any(axis=1)]
+        if np.isin(far, piece[mesh.fixed == 1]).any() or not np.isin(far, on_the_way).all():
+            return none
+        return np.flatnonzero(np.isin(piece, far))
 
     def inverted(self, u: np.ndarray) -> int:
         """How many tetrahedra are turned inside out at a displacement [m], shape (n, 3)."""
