@@ -10,6 +10,7 @@ from test_blade import contact_at
 
 from cutting.methods import make_method
 from cutting.settings import CuttingSettings
+from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance, Sweep
 from tissue_sim.coupling import PUSH, Coupling
 from tissue_sim.dynamics import Dynamics, TimeStepping
@@ -214,14 +215,18 @@ def test_energy_from_nowhere_is_found_before_it_is_large() -> None:
     assert 'farther' in guard.trouble(u, np.nan, 0.0)
 
 
-def test_a_loose_piece_that_is_pushed_away_stops_and_the_rest_goes_on() -> None:
+@pytest.mark.parametrize('active', [ActiveSettings(), ActiveSettings('on')], ids=['all', 'region'])
+def test_a_loose_piece_that_is_pushed_away_stops_and_the_rest_goes_on(
+    active: ActiveSettings,
+) -> None:
     rest, tets = box((4, 4, 2), 0.01)
     piece, others = box((1, 1, 1), 0.01)
     nodes = np.concatenate([rest, piece + np.array([0.0, 0.0, 0.03])])
     mesh = TetMesh(nodes, np.concatenate([tets, others + len(rest)]), nodes[:, 2] < 1e-9)
-    dynamics = Dynamics(mesh, Material(5000.0, 0.4, 1000.0, 5.0, 1e-3))
+    dynamics = Dynamics(mesh, Material(5000.0, 0.4, 1000.0, 5.0, 1e-5), active=active)
     size, free = float(np.linalg.norm(np.ptp(nodes, axis=0))), np.arange(len(rest), len(nodes))
     dynamics.velocity[free, 0] = 2.0
+    dynamics.velocity[free, 2] = np.random.default_rng(0).normal(0.0, 0.5, len(free))
     dynamics.restart()
     corner = np.array([np.argmax(rest.sum(axis=1))])
     troubles, depth, count = [], 0.0, 0
@@ -230,6 +235,8 @@ def test_a_loose_piece_that_is_pushed_away_stops_and_the_rest_goes_on() -> None:
         motion = dynamics.advance(Coupling(PUSH, corner, np.ones(1), before, here, stiffness=200.0))
         assert not motion.diverged
         troubles.append(motion.trouble)
+        energy = dynamics.model.evaluate(dynamics.displacement)[1]
+        assert motion.elastic_energy == pytest.approx(energy, rel=1e-6)
         count += motion.substeps
         assert dynamics.displacement[corner[0], 2] < depth
         depth = dynamics.displacement[corner[0], 2]

@@ -255,6 +255,7 @@ class Dynamics:
         v[: 3 * n].reshape(-1, 3)[lost] = 0.0
         self.inverse_mass.reshape(-1, 3)[lost] = 0.0
         self._u, self._v = u.copy(), v.copy()
+        self._touched.append(np.arange(n))
         return True
 
     def _integrate(self, coupling: Coupling, dt: float, substeps: int) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from tissue_sim.mesh import TetMesh, tetrahedron_volumes
-from tissue_sim.mesh_checks import components
+from tissue_sim.mesh_checks import EDGES, components
 
 TOOL_SPEED = 3.0
 """[m/s] above which a tool has not moved but jumped; hands come to 2."""
@@ -78,8 +78,7 @@ class Guard:
         none = np.zeros(0, np.int64)
         if not gone.any() or not mesh.fixed.any():
             return none
-        links = np.concatenate([mesh.tetrahedra[:, [0, k]] for k in (1, 2, 3)])
-        piece = components(mesh.node_count, links)[1]
+        piece = components(mesh.node_count, mesh.tetrahedra[:, EDGES].reshape(-1, 2))[1]
         far = np.unique(piece[gone])
         on_the_way = piece[(np.abs(before) > self._size / 2).any(axis=1)]
         if np.isin(far, piece[mesh.fixed == 1]).any() or not np.isin(far, on_the_way).all():
