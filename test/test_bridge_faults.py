@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -135,9 +136,17 @@ class FaultyWorld(World):
 
     def press(self) -> None:
         """Presses from above, and waits until the hand feels the tissue steadily."""
+        asked = len(self.record.states)
         if self.record.states[-1][1] == 'FAULT':
             self.command.publish(self.message(string='enable'))
-        self.wait_for('ENABLED', 5.0)
+        end = time.monotonic() + 10.0
+        while self.record.states[-1][1] != 'ENABLED':
+            assert time.monotonic() < end, f'no ENABLED: {self.record.states}'
+            if len(self.record.states) > asked:  # refused: this test was kept from sending
+                asked = len(self.record.states)
+                time.sleep(0.2)
+                self.command.publish(self.message(string='enable'))
+            time.sleep(0.01)
         self.move(PRESSED, 0.2)
         deadline = time.monotonic() + 20.0
         while not self.is_steady():
@@ -259,7 +268,8 @@ def test_no_force_exceeds_the_limits_and_none_changes_faster_than_it_may(record)
     faster = steps > allowed + 1e-3
     at_once = ~forces[1:].any(axis=1)
     assert not (faster & ~at_once).any()
-    entered = sum(state == 'FAULT' for _, state in record.states)
+    names = [state for _, state in record.states]
+    entered = sum(b == 'FAULT' != a for a, b in pairwise(names))
     assert len(POSES) <= entered < len(POSES) + 4
     assert (faster & at_once).sum() <= entered + 1  # and when it is asked to end
 

@@ -84,6 +84,7 @@ HERE = (
     'report BAG -o report.html',
     'resimulate BAG',
     'resimulate BAG --with tissue.material.toughness=40',
+    'resimulate bags/samples/format_2/crossing_cuts --with tissue.integration.frequency_growth=2',
     'export BAG tables',
     'export BAG mesh.vtu --at 12',
     'repair BAG',

@@ -9,7 +9,7 @@ from session.errors import SessionError
 
 Points = NDArray[np.float64]
 
-HELD = 0.05
+HELD = 0.15
 """Share of the nodes that are fixed, the lowest."""
 LEAST_HELD = 6
 TOOL_RADIUS = 0.004
@@ -149,7 +149,7 @@ def scene_text(
         tetrahedra=len(tetrahedra),
         edge=1e3 * edge,
         held=_held(nodes, edge),
-        threshold=0.15 * radius / TOOL_RADIUS,
+        threshold=0.05 * radius / TOOL_RADIUS,
         press=press,
         contact=2 * radius,
         radius=radius,
@@ -162,13 +162,13 @@ def scene_text(
         near=at(x, 3 * radius),
         pressed=at(x, radius - press),
         over=at(low, free),
-        pushed_in=at(low, -3.5 * radius),
-        first=at(low, -1.5 * radius),
-        middle=at(middle, -1.5 * radius),
-        last=at(high, -1.5 * radius),
+        pushed_in=at(low, -4 * radius),
+        first=at(low, -2.5 * radius),
+        middle=at(middle, -2.5 * radius),
+        last=at(high, -2.5 * radius),
         out=at(high, 4 * radius),
         end=at(high, 8 * radius),
-        deep=2.5e3 * radius,
+        deep=3.5e3 * radius,
     )
 
 
