@@ -217,6 +217,24 @@ def test_a_replica_that_follows_the_deltas_has_the_same_bits() -> None:
     assert encoder.encode(u, 99, 0, None, 0) is None
 
 
+def test_of_a_large_tissue_only_the_whole_mesh_carries_a_hash(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    messages = pytest.importorskip('tissue_sim.messages', reason='needs ROS')
+    mesh = TetMesh(*irregular_box((2, 2, 2), 0.01, 3))
+    u = np.zeros_like(mesh.rest)
+    replica = MeshReplica()
+    replica.load(as_message(mesh, u, 0))
+    encoder = messages.DeltaEncoder(mesh, u)
+    for most in (len(mesh.tetrahedra), 10):
+        monkeypatch.setattr(messages, '_HASHED', most)
+        touched = mesh.apply(TopologyDelta(removed_tetrahedra=np.array([0])))
+        delta = encoder.encode(u, 1, 0, touched, 1)
+        assert replica.apply(delta)
+        assert delta.state_hash == (replica.hash() if most > 10 else 0)
+    assert messages.mesh_message(mesh, u, '', 2, 1, 0).state_hash == replica.hash()
+
+
 def test_a_replica_refuses_a_delta_of_another_base_and_passes_over_an_old_one() -> None:
     mesh = TetMesh(*irregular_box((1, 1, 1), 0.01, 3))
     replica = MeshReplica()

@@ -63,3 +63,30 @@ def test_a_sliver_in_a_large_tissue_raises_the_bound_as_a_search_of_the_whole_do
     whole = FrequencyBound(model, inverse).omega
     assert whole > 1.2 * before
     assert bound.omega == pytest.approx(whole, rel=0.02)
+
+
+def test_a_compliance_in_a_large_tissue_outlives_cuts_and_stays_below_the_true_one() -> None:
+    """A blade that cuts in every frame would else begin with nothing each time."""
+    model, inverse = large()
+    mesh = model.mesh
+    rest = mesh.rest.copy()
+    middle = rest.max(axis=0) * [0.5, 0.5, 1.0]
+    nodes = np.argsort(np.linalg.norm(rest - middle, axis=1))[:3]
+    weights = np.full(3, 1 / 3)
+    far = np.linalg.norm(rest[mesh.tetrahedra].mean(axis=1) - middle, axis=1)
+    kept = PointCompliance()
+    for cut in range(4):
+        for _ in range(3 if cut == 0 else 1):
+            found = kept.estimate(model, inverse > 0, nodes, weights, np.eye(3))
+        anew = PointCompliance().estimate(model, inverse > 0, nodes, weights, np.eye(3))
+        exact = PointCompliance(200).estimate(model, inverse > 0, nodes, weights, np.eye(3))
+        least = np.linalg.eigvalsh(exact - found).min()
+        assert least > -1e-6 * np.linalg.norm(exact)
+        error, without = (1 - np.trace(value) / np.trace(exact) for value in (found, anew))
+        assert error < 0.05
+        assert cut == 0 or error < 0.5 * without
+        assert kept.calls == (3 if cut == 0 else 1)
+        gone = np.flatnonzero((far > 0.012) & (far < 0.014))[cut : cut + 1]
+        model.update(mesh.apply(TopologyDelta(removed_tetrahedra=gone)))
+        inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / model.mass), 3)
+        far = np.linalg.norm(mesh.rest[mesh.tetrahedra].mean(axis=1) - middle, axis=1)

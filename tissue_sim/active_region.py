@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from tissue_sim.coupling import FREE, Coupling
-from tissue_sim.elasticity import ElasticModel, Operands, internal_force
+from tissue_sim.elasticity import ElasticModel, Operands, Part, internal_force
 from tissue_sim.mesh import grown
 from tissue_sim.rings import intervals, without
 
@@ -50,11 +50,13 @@ class Region(NamedTuple):
         spans: their intervals, shape (s, 2).
         operands: for the force on them.
         around: for the force on them and their neighbours.
+        part: the nodes on their own, if that is cheaper.
     """
 
     spans: np.ndarray
     operands: Operands
     around: Operands
+    part: Part | None
 
 
 @njit(cache=True)
@@ -75,6 +77,11 @@ def _measure(f, v, inverse_mass, seconds, tolerance, looked, quiet):
             gain += (f[k] * inverse_mass[k] * seconds) ** 2
         slow = max(speed, gain) < tolerance * tolerance
         quiet[i] = min(quiet[i] + 1, 1000) if slow else 0
+
+
+def _misses(region: Region, coupling: Coupling) -> bool:
+    """Whether the tool holds a node that the part lacks."""
+    return region.part is not None and bool((region.part.place.local[coupling.nodes] < 0).any())
 
 
 class ActiveRegion:
@@ -164,7 +171,7 @@ class ActiveRegion:
         """
         if self.whole:
             operands = self._model.operands()
-            return Region(operands.awake, operands, operands)
+            return Region(operands.awake, operands, operands, None)
         looked, operands = self._looked(coupling)
         damped, f = self._room(len(u))
         _ahead(operands.reach, u, v, beta, damped)
@@ -179,10 +186,12 @@ class ActiveRegion:
             # The others sleep: their neighbours may wake them.
             self._quiet[without(candidates, awake)] = _PATIENCE
         v.reshape(-1, 3)[without(self._awake, awake)] = 0.0
-        if self._region is None or not np.array_equal(awake, self._awake):
-            self._region = self._surround(awake)
+        region = self._region
+        if region is None or not np.array_equal(awake, self._awake) or _misses(region, coupling):
+            self._region = self._surround(awake, coupling)
         self._moved = grown(self._moved, self._model.mesh.node_count)
         self._moved[awake] = True
+        assert self._region is not None
         return self._region
 
     def _looked(self, coupling: Coupling) -> tuple[np.ndarray, Operands]:
@@ -195,7 +204,7 @@ class ActiveRegion:
         whole = len(looked) == self._model.mesh.node_count
         return looked, self._model.operands(None if whole else looked)
 
-    def _surround(self, awake: np.ndarray) -> Region:
+    def _surround(self, awake: np.ndarray, coupling: Coupling) -> Region:
         """Takes some nodes as those that move, sorted, shape (a,)."""
         model = self._model
         level = model.neighbours.levels(awake, 3)
@@ -203,7 +212,9 @@ class ActiveRegion:
         n = model.mesh.node_count
         inner = model.operands() if len(awake) == n else model.operands_within(level, 0)
         outer = inner if len(self._near) == n else model.operands_within(level, 1)
-        return Region(intervals(level, 0), inner, outer)
+        some = len(awake) < n and not self._implicit
+        part = model.part(awake, self._near, coupling.nodes) if some else None
+        return Region(intervals(level, 0), inner, outer, part)
 
     def _room(self, size: int) -> np.ndarray:
         if self._scratch.shape[1] != size:

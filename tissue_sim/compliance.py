@@ -5,6 +5,7 @@ from numba import njit
 
 from tissue_sim.elasticity import ElasticModel, stiffness_product
 from tissue_sim.errors import MeshError
+from tissue_sim.mesh import grown
 from tissue_sim.rings import PATCH, spans_of, without
 
 _AT_MOST = 100_000
@@ -141,7 +142,8 @@ class PointCompliance:
     frame suffice. Of a large tissue the PATCH nodes around the point yield, and the rest is held.
 
     Args:
-        steps: conjugate-gradient steps a call and direction.
+        steps: conjugate-gradient steps a call and direction; of a large tissue, where what is known
+            outlives cuts, no more than twice as many for all directions.
 
     Attributes:
         calls: since connectivity or number of directions last changed.
@@ -177,10 +179,8 @@ class PointCompliance:
             off at `LIMP`.
         """
         n = model.mesh.node_count
-        if model.mesh.topology != self._topology or self._x.shape != (len(axes), 3 * n):
-            self._x = np.zeros((len(axes), 3 * n))
-            self._held = np.zeros((5, 3 * n))
-            self._patch = np.zeros(0, np.int64)
+        if model.mesh.topology != self._topology or len(self._x) != len(axes):
+            self._begin(len(axes), n)
             self._topology = model.mesh.topology
             self.calls = 0
         self.calls += 1
@@ -200,10 +200,12 @@ class PointCompliance:
             b[at] = np.where(free[at], b[at], 0.0)
             load[:] = b[at]
             least = float(preconditioner[at] @ np.square(load)) * _SETTLED**2
+            x[at] *= free[at]
             most = self._steps, least
             if len(patch) == n:
                 _conjugate_gradients(operands, preconditioner, b, x, work, *most)
             else:
+                most = min(self._steps, 2 * self._steps // len(axes)), least
                 _patch_gradients(operands, spans, preconditioner, b, x, work, *most)
             residual[:] = work[0][at]
         x = np.ascontiguousarray(self._x[:, at])
@@ -213,3 +215,12 @@ class PointCompliance:
             return LIMP * np.eye(len(axes))
         sizes, vectors = np.linalg.eigh((value + value.T) / 2)
         return (vectors * np.clip(sizes, 0.0, LIMP)) @ vectors.T
+
+    def _begin(self, axes: int, n: int) -> None:
+        """Makes room for so many directions and nodes; in a large tissue what is known stays."""
+        if n <= PATCH or len(self._x) != axes:
+            self._x, self._held = np.zeros((axes, 3 * n)), np.zeros((5, 3 * n))
+            self._patch = np.zeros(0, np.int64)
+        elif self._x.shape[1] < 3 * n:
+            self._x = grown(self._x.T, 3 * n).T.copy()
+            self._held = np.zeros((5, self._x.shape[1]))

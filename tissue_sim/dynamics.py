@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tissue_sim.active_region import ActiveRegion, ActiveSettings
+from tissue_sim.active_region import ActiveRegion, ActiveSettings, Region
 from tissue_sim.compliance import solve_static
-from tissue_sim.coupling import FREE, Coupling
+from tissue_sim.coupling import FREE, Coupling, Spring
 from tissue_sim.elastic_state import ElasticState
 from tissue_sim.elasticity import ElasticModel, ModelName
 from tissue_sim.guard import Guard
@@ -281,20 +281,46 @@ class Dynamics:
                 self._frame_time,
             )
             steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
-            work += self._integrator.step(
+            work += self._steps(region, spring, dt, steps, first=done, total=substeps)
+            done += steps
+        return work
+
+    def _steps(
+        self, region: Region, spring: Spring, dt: float, steps: int, *, first: int, total: int
+    ) -> float:
+        """Moves the nodes of a region by some substeps; returns the work of the spring [J]."""
+        size, part = 3 * self.mesh.node_count, region.part
+        u, v = self._u[:size], self._v[:size]
+        if part is None:
+            return self._integrator.step(
                 region.operands,
                 self.inverse_mass,
                 self.model.diagonal,
                 spring,
-                self._u[:size],
-                moving,
+                u,
+                v,
                 dt,
                 steps,
                 spans=region.spans,
-                first=done,
-                total=substeps,
+                first=first,
+                total=total,
             )
-            done += steps
+        at, own = part.place.at, part.place.at[: 3 * part.place.moving]
+        local_u, local_v = u[at], v[at]
+        work = self._integrator.step(
+            part.operands,
+            self.inverse_mass[at],
+            self.model.diagonal[at],
+            part.place.spring(spring),
+            local_u,
+            local_v,
+            dt,
+            steps,
+            spans=part.operands.awake,
+            first=first,
+            total=total,
+        )
+        u[own], v[own] = local_u[: len(own)], local_v[: len(own)]
         return work
 
     def _motion(self, dt: float, substeps: int, trouble: str) -> Motion:

@@ -17,6 +17,14 @@ from numba import njit
 
 from tissue_sim.corotational import CorotationalElements, Elements, add_elements
 from tissue_sim.domains import Domains, NodeDomains, add_domains, add_still_domains
+from tissue_sim.local_rows import (
+    LARGEST,
+    NO_LOCAL_ROWS,
+    Locality,
+    LocalRows,
+    local_product,
+    locality,
+)
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, Touched, grown
 from tissue_sim.rings import Neighbours, chunks_around, intervals, nodes_of_chunks
@@ -45,6 +53,7 @@ class Operands(NamedTuple):
         awake: intervals of nodes whose rows and domains are evaluated, shape (s, 2).
         reach: intervals of nodes that these read and write, shape (s, 2).
         chunks: of elements that are evaluated, shape (k,).
+        local: whole rows of a part on its own, by whose numbers u and f then are; none likewise.
     """
 
     rows: Rows
@@ -54,6 +63,19 @@ class Operands(NamedTuple):
     awake: np.ndarray
     reach: np.ndarray
     chunks: np.ndarray
+    local: LocalRows
+
+
+class Part(NamedTuple):
+    """Some nodes on their own.
+
+    Attributes:
+        place: which, and their numbers.
+        operands: for the force on them, by these numbers.
+    """
+
+    place: Locality
+    operands: Operands
 
 
 @njit(cache=True, error_model='numpy')
@@ -70,6 +92,9 @@ def internal_force(operands, u, f, turns):
     Returns:
         Elastic energy of domains and elements [J].
     """
+    if operands.local.first.shape[0] > 0:
+        local_product(operands.local, u, f)
+        return 0.0
     for s in range(operands.reach.shape[0]):
         f[3 * operands.reach[s, 0] : 3 * operands.reach[s, 1]] = 0.0
     add_rows(operands.rows, operands.awake, u, f)
@@ -326,7 +351,24 @@ class ElasticModel:
             rows,
             reach,
             chunks,
+            NO_LOCAL_ROWS,
         )
+
+    def part(self, nodes: np.ndarray, around: np.ndarray, others: np.ndarray) -> Part | None:
+        """Some nodes on their own, where a step of them is cheaper so; else None.
+
+        Args:
+            nodes, around, others: see `locality`.
+        """
+        if self.name != 'linear' or self.tensor_mass is None or len(nodes) > LARGEST:
+            return None
+        place = locality(self.tensor_mass.operands, nodes, around, others, self.mesh.node_count)
+        own, all_of_them = np.array([[0, len(nodes)]]), np.array([[0, len(place.at) // 3]])
+        none = np.zeros(0, np.int64)
+        operands = Operands(
+            _NO_ROWS, _NO_DOMAINS, _NO_ELEMENTS, 0, own, all_of_them, none, place.rows
+        )
+        return Part(place, operands)
 
     def evaluate(self, u: np.ndarray) -> tuple[np.ndarray, float]:
         """Elastic force that resists a displacement (the internal force is its negative).

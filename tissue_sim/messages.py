@@ -13,6 +13,9 @@ from tissue_sim.replica import MeshReplica, state_hash
 from tissue_sim.ros import FRAME, stamp
 from tissue_sim.stamps import REVISIONS
 
+_HASHED = 25_000
+"""Tetrahedra up to which a change of connectivity carries a hash of the whole, whose cost follows
+the tissue and not the cut; of more, the keyframes alone do."""
 _CODES = {'d': np.float64, 'I': np.uint32, 'B': np.uint8}
 
 
@@ -75,7 +78,7 @@ class DeltaEncoder:
             touched: what the last change of connectivity wrote, if it came since the last delta.
             cut_step: frame whose shape that change was computed on.
         """
-        n = self._mesh.node_count
+        mesh, n = self._mesh, self._mesh.node_count
         if touched is None:
             differs = displacement != self._sent
             displaced = np.flatnonzero(differs[:, 0] | differs[:, 1] | differs[:, 2])
@@ -83,21 +86,22 @@ class DeltaEncoder:
                 return None
         else:
             displaced = np.arange(n)
-        message = MeshDelta(base_revision=self.revision, step=step, topology=self._mesh.topology)
+        message = MeshDelta(base_revision=self.revision, step=step, topology=mesh.topology)
         self.revision = (self.revision + 1) % REVISIONS
         message.revision = self.revision
         message.header.frame_id = FRAME
         message.header.stamp = stamp(time_ns)
         message.node_count = n
-        message.tetrahedron_count = len(self._mesh.tetrahedra)
-        message.triangle_count = len(self._mesh.triangles)
+        message.tetrahedron_count = len(mesh.tetrahedra)
+        message.triangle_count = len(mesh.triangles)
         if len(displaced) < n:
             message.displaced = packed('I', displaced)
         message.displacement = packed('d', displacement[displaced])
         if touched is not None:
             self._connectivity(message, touched)
             message.cut_step = cut_step
-            message.state_hash = state_hash(self._mesh.rest, displacement, self._mesh.tetrahedra)
+            if message.tetrahedron_count <= _HASHED:
+                message.state_hash = state_hash(mesh.rest, displacement, mesh.tetrahedra)
         self._sent = displacement.copy()
         return message
 
