@@ -19,7 +19,7 @@ from tissue_sim.rings import intervals, without
 
 _BLOCK = 4
 """Substeps between two choices while some nodes sleep, where no cut has shortened them."""
-_BLOCK_AWAKE, _CHOICES_AWAKE = 16, 6
+_BLOCK_AWAKE, _CHOICES_AWAKE = 16, 3
 """While none sleeps, or as many move as may, a new choice would change little: substeps between two
 at least, and how many a frame has at most. A choice costs as much as some four substeps."""
 _RINGS = 2

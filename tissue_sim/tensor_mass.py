@@ -127,7 +127,7 @@ def packed(
     values: np.ndarray,
     filled: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and values with the rows side by side again, where half of all slots lie idle.
+    """Columns and values with the rows side by side again, where one slot in nine lies idle.
 
     No number changes and no order does, so neither does a result: it may be done between any two
     frames, and costs a copy.
@@ -143,7 +143,7 @@ def packed(
         The two given, or two new ones with spare room for as much again.
     """
     slots = int(used[:count].sum())
-    if filled[0] <= 2 * slots + 4096:
+    if filled[0] <= slots + slots // 8 + 1024:
         return columns, values
     width = len(values) // len(columns)
     most = 2 * slots
