@@ -120,6 +120,12 @@ class ActiveRegion:
         """Whether all nodes move, whatever they do."""
         return self._settings.mode == 'off'
 
+    @property
+    def held_to(self) -> np.ndarray | None:
+        """The nodes that move where the budget holds others, which no force wakes; else None."""
+        full = self._settings.mode == 'budget' and self.count >= self._settings.nodes
+        return self._awake if full else None
+
     def moved(self) -> np.ndarray:
         """The nodes that have moved since this was last asked, sorted, shape (a,)."""
         n = self._model.mesh.node_count

@@ -164,6 +164,7 @@ class PointCompliance:
         nodes: np.ndarray,
         weights: np.ndarray,
         axes: np.ndarray,
+        moving: np.ndarray | None = None,
     ) -> np.ndarray:
         """Refines and returns the compliance.
 
@@ -172,6 +173,7 @@ class PointCompliance:
             free: True where a coordinate can move, shape (3 n,).
             nodes, weights: that share the force, each once, shape (c,).
             axes: unit vectors, square to each other, along which forces act, shape (d, 3).
+            moving: nodes that yield, where others are held whatever acts on them, shape (a,).
 
         Returns:
             Displacement along axis i for 1 N along axis j [m/N], positive semidefinite,
@@ -184,7 +186,10 @@ class PointCompliance:
             self._topology = model.mesh.topology
             self.calls = 0
         self.calls += 1
-        patch = model.neighbours.around(nodes, 0, PATCH) if n > PATCH else np.arange(n)
+        if moving is not None:
+            patch = np.union1d(moving, nodes)
+        else:
+            patch = model.neighbours.around(nodes, 0, PATCH) if n > PATCH else np.arange(n)
         operands = model.operands(patch if len(patch) < n else None)
         at = (3 * patch[:, None] + np.arange(3)).ravel()
         left = without(self._patch, patch)

@@ -104,8 +104,9 @@ class ContactStiffness:
     def _compliance(
         self, point: PointCompliance, nodes: np.ndarray, weights: np.ndarray, axes: np.ndarray
     ) -> np.ndarray:
-        free = self._dynamics.inverse_mass > 0
-        return point.estimate(self._dynamics.model, free, nodes, weights, axes)
+        """Of what is simulated: nodes that a budget holds do not yield to the hand either."""
+        d = self._dynamics
+        return point.estimate(d.model, d.inverse_mass > 0, nodes, weights, axes, d.held_to)
 
 
 def spring_of(contact: ToolContact) -> Coupling:

@@ -152,6 +152,11 @@ class Dynamics:
         return self._active.count
 
     @property
+    def held_to(self) -> np.ndarray | None:
+        """The only nodes that can move now, sorted, shape (a,); None: all that are not fixed."""
+        return self._active.held_to
+
+    @property
     def inverted(self) -> int:
         """How many tetrahedra are turned inside out."""
         return self._guard.inverted(self.displacement)

@@ -6,6 +6,7 @@ tissue moved, delta and force made and serialised, the whole mesh every five sec
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
 from tissue_sim.contact import Command, Frame, State, ToolContact, press_triangle
 from tissue_sim.dynamics import TimeStepping
+from tissue_sim.material import Material
 from tissue_sim.messages import DeltaEncoder, force_message, mesh_message
 from tissue_sim.simulation import TissueSimulation
 
@@ -29,6 +31,8 @@ _UP = np.array([0.0, 0.0, 1.0])
 _STEP, _WAY, _LANE = 1e-3, 0.03, 0.006
 """[m]: the blade's way in a frame, 30 mm/s; the length of a stroke; from one to the next."""
 _DEEP = 0.010
+_EDGE = 0.0093
+"""[m]: edge of a box of which the highest frequency is that of `liver`'s mesh."""
 _WHOLE, _LARGE = 25_000, 100_000
 """Tetrahedra up to which all nodes move, and up to which that is measured beside a region."""
 
@@ -64,7 +68,7 @@ class _Load:
         m = tissue.material
         self._simulation = TissueSimulation(
             self._mesh,
-            liver_material(),
+            self._material(),
             Resistance(tissue.cut_threshold if cut else 10.0, m.toughness, m.blade_friction),
             model='linear',
             stepping=TimeStepping(
@@ -80,6 +84,12 @@ class _Load:
         self._method = make_method(CuttingSettings())
         self._encoder = DeltaEncoder(self._mesh, self._simulation.displacement)
         self._asked: Frame | None = None
+
+    def _material(self) -> Material:
+        """That of `liver`, the highest frequency damped as its mesh has it: beta by the edge."""
+        material, volume = liver_material(), float(np.prod(SIZE))
+        edge = (6 * volume / len(self._mesh.tetrahedra)) ** (1 / 3)
+        return replace(material, beta=material.beta * min(edge / _EDGE, 1.0))
 
     def measure(self, frames: int) -> list[Figure]:
         """Figures of so many frames."""
