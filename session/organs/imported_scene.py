@@ -13,6 +13,8 @@ HELD = 0.15
 """Share of the nodes that are fixed, the lowest."""
 LEAST_HELD = 6
 TOOL_RADIUS = 0.004
+DAMPING = 1e-4 / 0.0093
+"""beta [s] by length of edge [m], as `liver` has it: it shortens the step of a finer mesh."""
 THINNEST = 0.003
 """[m] that an organ must measure along each axis."""
 CUT_LENGTH = 0.04
@@ -29,7 +31,7 @@ tissue:
     # Lower than measured, so that the tissue opens before it has yielded by centimetres.
     toughness: 10
     blade_friction: 2
-  damping: {{alpha: 15, beta: 1.0e-4}}
+  damping: {{alpha: 15, beta: {beta:.2g}}}
   # What does not move: the underside. Give boxes instead to hold it elsewhere.
   fixed:
     - below: {{axis: z, value: {held:.6g}}}
@@ -148,6 +150,7 @@ def scene_text(
         nodes=len(nodes),
         tetrahedra=len(tetrahedra),
         edge=1e3 * edge,
+        beta=DAMPING * edge,
         held=_held(nodes, edge),
         threshold=0.05 * radius / TOOL_RADIUS,
         press=press,
