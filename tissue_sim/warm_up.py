@@ -7,15 +7,17 @@ import numpy as np
 
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
+from tissue_sim.compliance import PointCompliance
 from tissue_sim.contact import State, ToolContact
 from tissue_sim.coupling import Coupling
 from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.elasticity import MODELS
+from tissue_sim.elasticity import MODELS, ElasticModel
 from tissue_sim.integrators import INTEGRATORS
 from tissue_sim.locate import closest_triangle, distance_to_triangles, locate_points
 from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, TopologyDelta
 from tissue_sim.simulation import TissueSimulation
+from tissue_sim.tensor_mass import TensorMass, packed
 
 _FRAMES = 40
 
@@ -72,6 +74,12 @@ def _warm_up_models() -> None:
         Dynamics(small_cube(), material, model, active=region).advance(Coupling())
     for integrator in INTEGRATORS:
         Dynamics(small_cube(), material, 'linear', TimeStepping(integrator)).advance(Coupling())
+    # What else only a large tissue meets, or one that has been cut for a while.
+    tissue, n = ElasticModel(small_cube(), material, 'linear'), 8
+    some, free = np.arange(n - 1), np.ones(3 * n, bool)
+    PointCompliance().estimate(tissue, free, some[-1:], np.ones(1), np.eye(3), some)
+    rows = TensorMass(tissue.mesh, 1.0, 1.0).tensors
+    packed(rows.start, rows.used, rows.room, n, rows.columns, rows.blocks, np.array([1 << 20]))
 
 
 def small_cube() -> TetMesh:
