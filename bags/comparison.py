@@ -234,7 +234,7 @@ def _check_frame(
         raise _Differs(what)
     simulation = computed.simulation
     try:
-        contact = record.contact and tool_contact(record.contact, simulation.mesh.node_count)
+        contact = record.contact and tool_contact(record.contact, simulation.mesh)
     except ValueError as error:
         raise _Differs(f'the contact that loaded this frame is refused now: {error}') from None
     frame = computed.frame(contact)

@@ -135,7 +135,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except FileNotFoundError:
-        raise BagError(f'{folder} is not a bag: it has no {METADATA_FILE}') from None
+        raise BagError(_no_bag(folder)) from None
     except NotADirectoryError:
         raise BagError(f'{folder} is a file: name the folder of the bag, {folder.parent}') from None
     except (yaml.YAMLError, ValueError) as error:
@@ -143,3 +143,12 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     if not (isinstance(content, dict) and isinstance(content.get(_ROOT), dict)):
         raise BagError(f'{path} is not the metadata of a bag: it has no {_ROOT}')
     return dict(content[_ROOT])
+
+
+def _no_bag(folder: Path) -> str:
+    """Why a folder is no bag, and what may have been meant."""
+    if not folder.exists():
+        return f'{folder} is not a bag: there is no such folder'
+    bags = sorted(path.parent.name for path in folder.glob(f'*/{METADATA_FILE}'))
+    inside = f', but bags in it: {", ".join(bags[-5:])}' if bags else ''
+    return f'{folder} is not a bag: it has no {METADATA_FILE}{inside}'

@@ -15,6 +15,14 @@ they are not judged."""
 ERROR_LEVEL = 2
 STOOD_STILL = 0.02
 """[s] between two turns of a loop of 1 kHz after which a bridge takes its device for silent."""
+_SLOW = (
+    ': the machine is busy, or the scene too heavy for it; see ./trainer doctor and '
+    './trainer plan SCENE'
+)
+_UNRECORDED = (
+    'the recorder got too few turns: the machine is busy; see ./trainer doctor. The session is '
+    'there but for these messages, and can be computed again up to the first contact that it lacks'
+)
 
 
 @dataclass(frozen=True)
@@ -55,8 +63,9 @@ def _bag(summary: Summary) -> list[str]:
     failures = []
     if not summary.complete:
         failures.append(f'{summary.bag} was not closed: what is there up to then can be read')
-    for topic, count in summary.lost.items():
-        failures.append(f'{count} messages of {topic} were lost on the way to the bag')
+    if summary.lost:
+        lost = ', '.join(f'{count} messages of {topic}' for topic, count in summary.lost.items())
+        failures.append(f'{lost} were lost on the way to the bag: {_UNRECORDED}')
     return failures
 
 
@@ -71,7 +80,8 @@ def _rates(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
         elif math.isnan(node.rate):
             failures.append(f'{name} never reported its rate on /diagnostics')
         elif abs(node.rate - nominal) > RATE_TOLERANCE * nominal:
-            failures.append(f'{name} ran at {node.rate:.4g} Hz instead of {nominal:g} Hz')
+            why = _SLOW if node.rate < nominal else ''
+            failures.append(f'{name} ran at {node.rate:.4g} Hz instead of {nominal:g} Hz{why}')
     return failures
 
 

@@ -328,7 +328,7 @@ COMMANDS = [
     words('', 'view --resimulate', '--resimulate', '--bag'),
     words('', 'report', "'bag'", 'missing', '--help'),
     words('', 'report a b', '(b)', 'unexpected', '--help'),
-    words('', 'report {}/none', '{}/none', 'not a bag', 'metadata.yaml'),
+    words('', 'report {}/none', '{}/none', 'not a bag', 'no such folder'),
     words('', 'report {}/file', '{}/file', 'is a file', 'name the folder'),
     words('', 'report BAG -o {}/x.htm', '{}/x.htm', 'end its name in .html'),
     words('', 'picture BAG -o {}/x.bmp', '{}/x.bmp', 'end its name in .png'),

@@ -21,6 +21,7 @@ from session.organs.surface_import import read_surface
 from session.scene import load_scene
 from session.status import Status
 from tissue_sim.assembly import make_simulation
+from tissue_sim.contact import State
 
 BODY = trimesh.creation.icosphere(subdivisions=3, radius=30.0)
 BODY.apply_scale([1.3, 1.0, 0.6])
@@ -228,8 +229,10 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     surface = saved(folder, without(17))
     command = [sys.executable, '-m', 'session.cli', 'import-mesh', str(surface), '--json']
     command += ['--edge', '0.009', '-o', str(folder / 'mine')]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == Status.OK, done.stderr
+    assert {path.suffix for path in folder.iterdir()} == {'.stl', '.msh', '.yaml'}
+    assert len([*folder.iterdir()]) == 3  # nothing of the mesher's own
     return folder / 'mine.yaml', json.loads(done.stdout)
 
 
@@ -275,16 +278,20 @@ def test_imported_scene_is_pressed_and_cut_by_its_own_script(
     )
     script = compile_script(scene.arm.script, scene.device.tissue_from_device)
     before = len(tissue.simulation.mesh.tetrahedra)
-    forces = []
+    forces, entered = [], 0
     for tick in range(int(1000 * script.seconds)):
         position = np.array(
             [np.interp(tick / 1000, script.times, script.positions[:, axis]) for axis in range(3)]
         )
         session.tick(position)
         forces.append(session.path.force_norm)
+        if tissue.simulation.state == State.INSIDE and not entered:
+            entered = tick
         assert session.frame is None or not session.frame.diverged
     cut = tissue.simulation.mesh.triangle_kind.sum()
     assert max(forces[:500]) == 0.0  # it starts above the organ
+    assert max(forces[2000:6000]) > 0.02  # it palpates,
+    assert entered > 7500  # and the blade goes in where it is to cut
     assert 0.1 < max(forces) < scene.profile.max_force
     assert forces[-1] == 0.0
     assert cut > 0

@@ -33,6 +33,7 @@ from tissue_sim.replica import MeshReplica, state_hash
 from tissue_sim.tool_contact import tool_contact
 
 NODES = 20
+TISSUE = SimpleNamespace(node_count=NODES, topology=0)
 BAD = (math.nan, math.inf, -math.inf, 1e300, -1e300)
 
 
@@ -85,10 +86,19 @@ def spoilt(values: np.ndarray, value: float) -> np.ndarray:
     'name', ['weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip']
 )
 def test_a_contact_with_a_number_that_cannot_be_is_refused_by_name(name: str, bad: float) -> None:
-    tool_contact(contact(), NODES)
+    tool_contact(contact(), TISSUE)
     with pytest.raises(MessageError, match=name) as refused:
-        tool_contact(contact(**{name: spoilt(getattr(contact(), name), bad)}), NODES)
+        tool_contact(contact(**{name: spoilt(getattr(contact(), name), bad)}), TISSUE)
     assert refused.value.reason == 'not finite or too far'
+
+
+def test_a_contact_of_before_a_cut_that_took_nodes_away_is_none_of_its_nodes() -> None:
+    """What it touched may be gone, and is nobody's fault; a blade in the tissue is held by it."""
+    late = tool_contact(contact(nodes=np.full(9, NODES, np.uint32), topology=7), TISSUE)
+    assert len(late.nodes) == len(late.weights) == 0
+    assert late.topology == 7
+    np.testing.assert_array_equal(late.blade_tip, contact().blade_tip)
+    assert len(tool_contact(contact(), TISSUE).nodes) > 0
 
 
 @pytest.mark.parametrize(
@@ -120,7 +130,7 @@ def test_a_contact_with_a_number_that_cannot_be_is_refused_by_name(name: str, ba
 )
 def test_each_other_field_of_a_contact_is_refused_with_its_reason(changed, reason: str) -> None:
     with pytest.raises(MessageError) as refused:
-        tool_contact(contact(**changed), NODES)
+        tool_contact(contact(**changed), TISSUE)
     assert refused.value.reason == reason
 
 

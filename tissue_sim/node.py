@@ -204,7 +204,7 @@ class TissueSimNode(ManagedNode):
                 self._contact, self._contact_received = message, now
             if self._contact is None or now - self._contact_received > _CONTACT_AGE_NS:
                 return None
-            return tool_contact(self._contact, self._simulation.mesh.node_count)
+            return tool_contact(self._contact, self._simulation.mesh)
         except ValueError as error:
             self.refusals.add(ros.CONTACT, error)
             self._contact = None  # one message is refused once

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from tissue_sim.contact import State, ToolContact
+from tissue_sim.mesh import TetMesh
 from tissue_sim.refusals import MessageError, require_frame
 
 _VECTORS = ('weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip')
@@ -13,13 +14,14 @@ _SOFTEST, _STIFFEST, _LARGEST = 1.0, 1e5, 0.1
 """[N/m] of the coupling: a scene has a tenth of it at most; [m] of the proxy."""
 
 
-def tool_contact(message: Any, node_count: int) -> ToolContact:
+def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
     """A contact for the core.
 
     Args:
         message: a `Contact` message as received, from anybody, or what a recorded frame has of it:
             the same fields, but for the header.
-        node_count: of the mesh.
+        mesh: the tissue. A message about another topology than its own, which a cut has just
+            changed, has no nodes of it: they may be others by now, or gone.
 
     Raises:
         MessageError: one sentence that says which field is wrong.
@@ -42,8 +44,8 @@ def tool_contact(message: Any, node_count: int) -> ToolContact:
         text = f'proxy_radius {message.proxy_radius} is not in 0 to {_LARGEST} m'
         raise MessageError('radius out of range', text)
     if message.state == State.TOUCHING or message.weights.any():
-        if message.nodes.max() >= node_count:
-            text = f'nodes {message.nodes.tolist()} go beyond the {node_count} nodes'
+        if message.topology == mesh.topology and message.nodes.max() >= mesh.node_count:
+            text = f'nodes {message.nodes.tolist()} go beyond the {mesh.node_count} nodes'
             raise MessageError('index out of range', text)
         if abs(message.weights.sum() - 1) > 1e-6 or message.weights.min() < -1e-6:
             text = f'weights {message.weights.tolist()} are not barycentric'
@@ -54,6 +56,8 @@ def tool_contact(message: Any, node_count: int) -> ToolContact:
     # A node of two touched triangles stands there twice.
     nodes, slots = np.unique(message.nodes.astype(np.int64), return_inverse=True)
     weights = np.bincount(slots, message.weights, len(nodes))
+    if message.topology != mesh.topology:
+        weights[:] = 0.0
     return ToolContact(
         state=State(message.state),
         topology=message.topology,

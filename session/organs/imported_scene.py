@@ -36,8 +36,8 @@ tissue:
   fixed:
     - below: {{axis: z, value: {held:.6g}}}
   cut_threshold: {threshold:.3g}
-  budget: {{displacement: {press:.3g}, rotation: 30, contact_radius: {contact:.3g}, error: 0.25}}
-  model: corotational_smoothed
+  budget: {{displacement: {press:.3g}, rotation: 30, contact_radius: {contact:.3g}, error: 0.35}}
+  model: linear_smoothed
   integrator: symplectic_euler
   integration: {{rate: 30, safety: 0.8, frequency_growth: 2, max_substeps: 400}}
 
@@ -142,7 +142,7 @@ def scene_text(
         return f'[{place:.5g}, {y:.5g}, {height + above:.5g}]'
 
     low, high, middle = ends[0], ends[-1], float(ends.mean())
-    press = radius
+    press = radius / 2
     free = max(heights) - min(heights) + 4 * radius
     return _SCENE.format(
         mesh=mesh,
@@ -152,7 +152,7 @@ def scene_text(
         edge=1e3 * edge,
         beta=DAMPING * edge,
         held=_held(nodes, edge),
-        threshold=0.05 * radius / TOOL_RADIUS,
+        threshold=0.08 * radius / TOOL_RADIUS,
         press=press,
         contact=2 * radius,
         radius=radius,

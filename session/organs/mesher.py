@@ -4,6 +4,7 @@ Of its own, because the mesher is native code: it may end the process, and takes
 as `python -m session.organs.mesher IN.npz OUT.npz`.
 """
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -47,6 +48,7 @@ def fill(
         raise SessionError(HOW_TO_GET_IT)
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     reason = ''
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
     with tempfile.TemporaryDirectory(prefix='trainer-') as folder:
         given, made = Path(folder, 'surface.npz'), Path(folder, 'solid.npz')
         np.savez(
@@ -54,7 +56,10 @@ def fill(
         )
         for _ in range(ATTEMPTS):
             command = [sys.executable, '-m', 'session.organs.mesher', str(given), str(made)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            # In there: the mesher leaves a file of its own where it is run.
+            done = subprocess.run(
+                command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+            )
             if done.returncode:
                 reason = (done.stderr.strip().splitlines() or [f'status {done.returncode}'])[-1]
                 continue

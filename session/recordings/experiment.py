@@ -210,7 +210,7 @@ def time_of_contact(record: FrameRecord) -> int:
 def _contact(computed: Recomputation, hand: Hand) -> ToolContact | None:
     if hand.contact is None:
         return None
-    return tool_contact(contact_message(hand.contact), computed.simulation.mesh.node_count)
+    return tool_contact(contact_message(hand.contact), computed.simulation.mesh)
 
 
 def _show(computed: Recomputation, hand: Hand, frame: Frame) -> None:

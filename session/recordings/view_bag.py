@@ -109,8 +109,8 @@ def _as_recorded(records: list[FrameRecord], computed: Recomputation) -> Iterato
             raise SessionError(f'frame {record.step} cannot be computed again: {what}')
         if record.has_contact and record.contact is None:
             raise SessionError(f'the bag lacks the contact of frame {record.step}')
-        nodes = computed.simulation.mesh.node_count
-        yield computed.frame(record.contact and tool_contact(record.contact, nodes))
+        mesh = computed.simulation.mesh
+        yield computed.frame(record.contact and tool_contact(record.contact, mesh))
 
 
 @contextmanager
