@@ -26,6 +26,8 @@ from bags.repair import repair_bag
 from bags.sequences import SequenceCounter
 from bags.writer import BagWriter
 
+SAMPLES = Path(__file__).resolve().parents[1] / 'bags' / 'samples' / 'format_2'
+
 LATCHED = OfferedQos(depth=1, durability='transient_local')
 TOPICS = {
     '/pose': ('geometry_msgs/msg/PoseStamped', OfferedQos(depth=1)),
@@ -422,3 +424,16 @@ def test_what_a_publisher_sent_before_it_was_heard_is_counted_apart(
     counter.add(41)
     counter.add(42)
     assert (counter.lost, counter.before) == (0, 40)
+
+
+def test_a_folder_that_is_no_bag_is_said_to_be_missing_or_to_have_bags_in_it(
+    tmp_path: Path,
+) -> None:
+    for folder, said in (
+        (tmp_path / 'none', 'there is no such folder'),
+        (tmp_path, r'it has no metadata\.yaml$'),
+        (SAMPLES, 'but bags in it: crossing_cuts, palpation, straight_cut'),
+    ):
+        with pytest.raises(BagError, match=said) as refused:
+            open_bag(folder)
+        assert str(refused.value).startswith(f'{folder} is not a bag: ')

@@ -211,6 +211,15 @@ def test_without_the_mesher_it_is_said_how_to_get_it(
         import_mesh(options(saved(tmp_path, BODY), tmp_path / 'made'))
 
 
+def test_an_organ_of_the_wrong_unit_is_asked_about(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = saved(tmp_path, BODY)
+    import_mesh(options(path, tmp_path / 'made', unit='cm', edge=0.1))
+    (warning,) = json.loads(capsys.readouterr().out)['warnings']
+    assert '0.78 m long' in warning and '--unit' in warning
+
+
 def test_mesher_that_dies_is_an_error_and_not_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,6 +31,8 @@ Points = NDArray[np.float64]
 TETRAHEDRA = 4000
 """Aimed at where no edge is given: what 30 Hz takes with room to spare."""
 MOST_TETRAHEDRA = 200_000
+LARGE = 0.5
+"""[m] that few organs exceed: a file in mm that is read as cm does."""
 FLUID = 20_000
 """Tetrahedra above which 30 Hz is not to be expected."""
 SAMPLES = 200_000
@@ -261,6 +263,8 @@ def _require_same_border(
 
 def _warnings(tetrahedra: int, worst: float, frame: Frame, surface: Surface) -> list[str]:
     warnings = []
+    if surface.size.max() > LARGE:
+        warnings.append(f'it is {surface.size.max():.2g} m long: is the unit right (--unit)?')
     if surface.parts > 1:
         warnings.append(f'the surface has {surface.parts} separate shells: is that meant?')
     if tetrahedra > FLUID:
