@@ -90,3 +90,15 @@ def test_a_compliance_in_a_large_tissue_outlives_cuts_and_stays_below_the_true_o
         model.update(mesh.apply(TopologyDelta(removed_tetrahedra=gone)))
         inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / model.mass), 3)
         far = np.linalg.norm(mesh.rest[mesh.tetrahedra].mean(axis=1) - middle, axis=1)
+
+
+def test_a_compliance_that_ran_away_in_a_large_tissue_begins_anew() -> None:
+    model, inverse = large()
+    nodes, up = np.array([model.mesh.rest.sum(axis=1).argmax()]), np.array([[0.0, 0.0, 1.0]])
+    given = model, inverse > 0, nodes, np.ones(1), up
+    point, other = PointCompliance(), PointCompliance()
+    expected = other.estimate(*given)
+    point.estimate(*given)
+    point._x[:, 3 * nodes] = np.nan
+    assert point.estimate(*given) == compliance.LIMP
+    np.testing.assert_array_equal(point.estimate(*given), expected)

@@ -198,7 +198,9 @@ class PointCompliance:
         b, preconditioner, work = self._held[0], self._held[1], self._held[2:5]
         preconditioner[at] = _diagonal_preconditioner(model.diagonal[at], free[at])
         loads, residuals = np.empty((2, len(axes), len(at)))
-        spans = spans_of(patch)
+        spans, steps = spans_of(patch), self._steps
+        if len(patch) < n:
+            steps = min(steps, 2 * steps // len(axes))
         for axis, load, x, residual in zip(axes, loads, self._x, residuals, strict=True):
             b[at] = 0.0
             b.reshape(-1, 3)[nodes] = weights[:, None] * axis
@@ -206,17 +208,15 @@ class PointCompliance:
             load[:] = b[at]
             least = float(preconditioner[at] @ np.square(load)) * _SETTLED**2
             x[at] *= free[at]
-            most = self._steps, least
             if len(patch) == n:
-                _conjugate_gradients(operands, preconditioner, b, x, work, *most)
+                _conjugate_gradients(operands, preconditioner, b, x, work, steps, least)
             else:
-                most = min(self._steps, 2 * self._steps // len(axes)), least
-                _patch_gradients(operands, spans, preconditioner, b, x, work, *most)
+                _patch_gradients(operands, spans, preconditioner, b, x, work, steps, least)
             residual[:] = work[0][at]
         x = np.ascontiguousarray(self._x[:, at])
         value = loads @ x.T + x @ residuals.T
         if not np.isfinite(value).all():
-            self._topology = -1  # what it has come to is no start for the next
+            self._x = np.zeros((0, 0))  # what it has come to is no start for the next
             return LIMP * np.eye(len(axes))
         sizes, vectors = np.linalg.eigh((value + value.T) / 2)
         return (vectors * np.clip(sizes, 0.0, LIMP)) @ vectors.T
