@@ -13,7 +13,8 @@ import numpy as np
 from numba import njit
 
 from tissue_sim.coupling import FREE, Coupling
-from tissue_sim.elasticity import ElasticModel, Operands, Part, internal_force
+from tissue_sim.elasticity import ElasticModel, Operands, internal_force
+from tissue_sim.local_rows import Locality
 from tissue_sim.mesh import grown
 from tissue_sim.rings import intervals, without
 
@@ -49,14 +50,14 @@ class Region(NamedTuple):
     Attributes:
         spans: their intervals, shape (s, 2).
         operands: for the force on them.
-        around: for the force on them and their neighbours.
-        part: the nodes on their own, if that is cheaper.
+        around: for the force on them and their neighbours, in the tissue.
+        place: if they are cheaper on their own: by whose numbers spans and operands then are.
     """
 
     spans: np.ndarray
     operands: Operands
     around: Operands
-    part: Part | None
+    place: Locality | None
 
 
 @njit(cache=True)
@@ -81,7 +82,7 @@ def _measure(f, v, inverse_mass, seconds, tolerance, looked, quiet):
 
 def _misses(region: Region, coupling: Coupling) -> bool:
     """Whether the tool holds a node that the part lacks."""
-    return region.part is not None and bool((region.part.place.local[coupling.nodes] < 0).any())
+    return region.place is not None and bool((region.place.local[coupling.nodes] < 0).any())
 
 
 class ActiveRegion:
@@ -194,11 +195,10 @@ class ActiveRegion:
         v.reshape(-1, 3)[without(self._awake, awake)] = 0.0
         region = self._region
         if region is None or not np.array_equal(awake, self._awake) or _misses(region, coupling):
-            self._region = self._surround(awake, coupling)
+            region = self._region = self._surround(awake, coupling)
         self._moved = grown(self._moved, self._model.mesh.node_count)
         self._moved[awake] = True
-        assert self._region is not None
-        return self._region
+        return region
 
     def _looked(self, coupling: Coupling) -> tuple[np.ndarray, Operands]:
         """The nodes that are looked at, sorted, and the operands for the force on them."""
@@ -216,11 +216,14 @@ class ActiveRegion:
         level = model.neighbours.levels(awake, 3)
         self._awake, self._near = awake, np.flatnonzero(level <= 1)
         n = model.mesh.node_count
-        inner = model.operands() if len(awake) == n else model.operands_within(level, 0)
-        outer = inner if len(self._near) == n else model.operands_within(level, 1)
         some = len(awake) < n and not self._implicit
         part = model.part(awake, self._near, coupling.nodes) if some else None
-        return Region(intervals(level, 0), inner, outer, part)
+        if part is not None:
+            around = model.operands_within(level, 1)
+            return Region(part.operands.awake, part.operands, around, part.place)
+        inner = model.operands() if len(awake) == n else model.operands_within(level, 0)
+        outer = inner if len(self._near) == n else model.operands_within(level, 1)
+        return Region(intervals(level, 0), inner, outer, None)
 
     def _room(self, size: int) -> np.ndarray:
         if self._scratch.shape[1] != size:

@@ -294,38 +294,25 @@ class Dynamics:
         self, region: Region, spring: Spring, dt: float, steps: int, *, first: int, total: int
     ) -> float:
         """Moves the nodes of a region by some substeps; returns the work of the spring [J]."""
-        size, part = 3 * self.mesh.node_count, region.part
-        u, v = self._u[:size], self._v[:size]
-        if part is None:
-            return self._integrator.step(
-                region.operands,
-                self.inverse_mass,
-                self.model.diagonal,
-                spring,
-                u,
-                v,
-                dt,
-                steps,
-                spans=region.spans,
-                first=first,
-                total=total,
-            )
-        at, own = part.place.at, part.place.at[: 3 * part.place.moving]
-        local_u, local_v = u[at], v[at]
+        size, place = 3 * self.mesh.node_count, region.place
+        at = slice(None) if place is None else place.at
+        u, v = self._u[:size][at], self._v[:size][at]
         work = self._integrator.step(
-            part.operands,
+            region.operands,
             self.inverse_mass[at],
             self.model.diagonal[at],
-            part.place.spring(spring),
-            local_u,
-            local_v,
+            spring if place is None else place.spring(spring),
+            u,
+            v,
             dt,
             steps,
-            spans=part.operands.awake,
+            spans=region.spans,
             first=first,
             total=total,
         )
-        u[own], v[own] = local_u[: len(own)], local_v[: len(own)]
+        if place is not None:  # else u and v are the tissue's own
+            own = 3 * place.moving
+            self._u[place.at[:own]], self._v[place.at[:own]] = u[:own], v[:own]
         return work
 
     def _motion(self, dt: float, substeps: int, trouble: str) -> Motion:

@@ -74,10 +74,12 @@ class Material(SceneModel):
     @classmethod
     def _fill_in_preset(cls, values: Any) -> Any:
         preset = values.get('preset') if isinstance(values, dict) else None
-        if isinstance(preset, str) and preset not in PRESETS:
+        if not isinstance(preset, str):
+            return values
+        if preset not in PRESETS:
             known = ', '.join(map(repr, PRESETS))
             raise ValueError(f'preset {preset!r} is not known: there are {known}')
-        return PRESETS[preset] | values if isinstance(preset, str) and preset in PRESETS else values
+        return PRESETS[preset] | values
 
 
 class Damping(SceneModel):

@@ -43,8 +43,9 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
     if not 0 <= message.proxy_radius <= _LARGEST:
         text = f'proxy_radius {message.proxy_radius} is not in 0 to {_LARGEST} m'
         raise MessageError('radius out of range', text)
+    current = message.topology == mesh.topology
     if message.state == State.TOUCHING or message.weights.any():
-        if message.topology == mesh.topology and message.nodes.max() >= mesh.node_count:
+        if current and message.nodes.max() >= mesh.node_count:
             text = f'nodes {message.nodes.tolist()} go beyond the {mesh.node_count} nodes'
             raise MessageError('index out of range', text)
         if abs(message.weights.sum() - 1) > 1e-6 or message.weights.min() < -1e-6:
@@ -56,7 +57,7 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
     # A node of two touched triangles stands there twice.
     nodes, slots = np.unique(message.nodes.astype(np.int64), return_inverse=True)
     weights = np.bincount(slots, message.weights, len(nodes))
-    if message.topology != mesh.topology:
+    if not current:
         weights[:] = 0.0
     return ToolContact(
         state=State(message.state),

@@ -14,7 +14,8 @@ from cutting.methods import make_method
 from cutting.settings import CuttingSettings
 from session.measure.bench_clock import Figure, figure
 from session.measure.bench_strokes import blade_contact
-from session.measure.bench_tissue import SIZE, box, liver_material
+from session.measure.bench_tissue import SIZE, box, edge_of, liver_material
+from session.organs.imported_scene import DAMPING
 from session.scene import load_scene
 from tissue_sim.active_region import ActiveSettings
 from tissue_sim.blade import Resistance
@@ -31,8 +32,6 @@ _UP = np.array([0.0, 0.0, 1.0])
 _STEP, _WAY, _LANE = 1e-3, 0.03, 0.006
 """[m]: the blade's way in a frame, 30 mm/s; the length of a stroke; from one to the next."""
 _DEEP = 0.010
-_EDGE = 0.0093
-"""[m]: edge of a box of which the highest frequency is that of `liver`'s mesh."""
 _WHOLE, _LARGE = 25_000, 100_000
 """Tetrahedra up to which all nodes move, and up to which that is measured beside a region."""
 
@@ -87,9 +86,8 @@ class _Load:
 
     def _material(self) -> Material:
         """That of `liver`, the highest frequency damped as its mesh has it: beta by the edge."""
-        material, volume = liver_material(), float(np.prod(SIZE))
-        edge = (6 * volume / len(self._mesh.tetrahedra)) ** (1 / 3)
-        return replace(material, beta=material.beta * min(edge / _EDGE, 1.0))
+        material, edge = liver_material(), edge_of(len(self._mesh.tetrahedra))
+        return replace(material, beta=min(DAMPING * edge, material.beta))
 
     def measure(self, frames: int) -> list[Figure]:
         """Figures of so many frames."""

@@ -30,9 +30,14 @@ _DEPTH, _SLIDE = 1.3e-3, 2e-4
 """[m]: how deep the tool presses, and how far it goes along the surface in a frame."""
 
 
+def edge_of(tetrahedra: int) -> float:
+    """Edge of the bricks [m] of a box of about so many tetrahedra."""
+    return float((6 * SIZE[0] * SIZE[1] * SIZE[2] / tetrahedra) ** (1 / 3))
+
+
 def box(tetrahedra: int) -> TetMesh:
     """A box of about so many tetrahedra, its bricks nearly cubes."""
-    edge = (6 * SIZE[0] * SIZE[1] * SIZE[2] / tetrahedra) ** (1 / 3)
+    edge = edge_of(tetrahedra)
     cells = (max(1, round(SIZE[0] / edge)), max(1, round(SIZE[1] / edge)))
     deep = max(1, round(tetrahedra / (6 * cells[0] * cells[1])))
     mesh = kuhn_block((*cells, deep), SIZE)
