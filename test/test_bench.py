@@ -65,7 +65,7 @@ def test_the_bytes_model_counts_each_edge_once_and_each_neighbour_of_a_domain() 
     edges = len(np.unique(pairs, axis=0))
     material = Material(3000.0, 0.4, 1000.0)
     linear = moved_bytes(ElasticModel(mesh, material, 'linear'))
-    assert linear == edges * (9 * 8 + 4) + n * (6 * 8 + 2 * 8 + 4 * 3 * 8)
+    assert linear == edges * (9 * 8 + 4) + n * (6 * 8 + 2 * 8 + 3 * 3 * 8)
     inside = int(((nodes > 1e-9) & (nodes < 0.02 - 1e-9)).all(axis=1).sum())
     smoothed = moved_bytes(ElasticModel(mesh, material, 'linear_smoothed'))
     assert smoothed == linear + (2 * edges + n - inside) * (3 * 8 + 4) + n * 24

@@ -7,7 +7,7 @@ from session.measure.bench_strokes import Session, array_bytes, measure
 from session.measure.strokes_report import LIMIT, Row, ratios
 from tissue_sim.domains import Domains, NodeDomains, add_still_domains
 from tissue_sim.mesh import TetMesh
-from tissue_sim.tensor_mass import TensorMass, Tensors, add_rows, packed
+from tissue_sim.tensor_mass import TensorMass, Tensors, packed, put_rows
 
 STROKES = 30
 
@@ -79,7 +79,7 @@ def test_packing_changes_no_force(cut: tuple[Session, list[Row]]) -> None:
 
 def product(values: TensorMass | NodeDomains, mesh: TetMesh, u: np.ndarray) -> np.ndarray:
     f, whole = np.zeros_like(u), np.array([[0, mesh.node_count]])
-    add = add_rows if isinstance(values, TensorMass) else add_still_domains
+    add = put_rows if isinstance(values, TensorMass) else add_still_domains
     add(values.operands, whole, u, f)
     return f
 

@@ -22,6 +22,7 @@ from tissue_sim.rotation import (
     stress,
     turn,
 )
+from tissue_sim.simd import prefetch
 from tissue_sim.tensor_mass import shape_gradients
 
 KEPT = 15
@@ -74,6 +75,7 @@ def gather_elements(elements, tetrahedra, rest, which, count, lame_lambda, lame_
 
 
 _U1, _U2 = np.uint32(1), np.uint32(2)
+_LINE = np.uint64(8)
 
 
 @njit(cache=True, fastmath=SAFE_MATH, error_model='numpy')
@@ -86,6 +88,9 @@ def _deformation(data, corners, u, chunk, unit):
     for b in range(L):
         i, j = np.uint32(C[b]), np.uint32(C[L + b])
         k, m = np.uint32(C[2 * L + b]), np.uint32(C[3 * L + b])
+        here = np.uint64(KEPT * (L + b))
+        prefetch(data, here)  # what the next chunk has
+        prefetch(data, here + _LINE)
         x, y, z = u[i], u[i + _U1], u[i + _U2]
         E[b], E[b + 3 * L], E[b + 6 * L] = u[j] - x, u[j + _U1] - y, u[j + _U2] - z
         E[b + L], E[b + 4 * L], E[b + 7 * L] = u[k] - x, u[k + _U1] - y, u[k + _U2] - z

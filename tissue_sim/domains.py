@@ -28,6 +28,16 @@ from tissue_sim.rotation import (
     stress,
     turn,
 )
+from tissue_sim.simd import (
+    add_three,
+    load_four,
+    plus_product,
+    prefetch,
+    product,
+    spread,
+    three,
+    unpack,
+)
 from tissue_sim.tensor_mass import longer, move_row, packed, shape_gradients
 
 
@@ -38,7 +48,7 @@ class Domains(NamedTuple):
         start, used, room: first slot, used slots and slots of each row, shape (n,).
         columns: three times the node j of each entry, shape (c,). The node itself is among them
             at the surface only: in the interior G_ii is 0.
-        vectors: G_ij [1/m], shape (3 c,).
+        vectors: G_ij [1/m]; some beyond the last row, as three are read as four, shape (3 c,).
         volume: of the domains [m^3], shape (n,).
         rotation: quaternions, shape (n, 4).
         lame: lambda and mu [Pa], shape (2,).
@@ -125,32 +135,44 @@ def gather_domains(domains, filled, links, rest, nodes):
 
 
 _U1, _U2, _U3 = (np.uint64(i) for i in (1, 2, 3))
+_AHEAD, _LINE = np.uint64(3 * 384), np.uint64(8)
+"""Numbers by which vectors are asked of memory beforehand, and how many come at once."""
+
+
+@njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
+def _gradient(domains, u, i):
+    """Rows of the averaged displacement gradient of a node."""
+    hx = hy = hz = spread(0.0)
+    first = np.uint64(domains.start[i])
+    for k in range(first, first + np.uint64(domains.used[i])):
+        j = np.uint64(domains.columns[k])
+        vector = load_four(domains.vectors, _U3 * np.uint64(k))  # and the first of the next
+        hx = plus_product(hx, spread(u[j]), vector)
+        hy = plus_product(hy, spread(u[j + _U1]), vector)
+        hz = plus_product(hz, spread(u[j + _U2]), vector)
+    return unpack(hx), unpack(hy), unpack(hz)
+
+
+@njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
+def _add_forces(domains, i, px, py, pz, f):
+    """Adds the forces V P G_ij over the row of a node, P given by its columns."""
+    vectors = domains.vectors
+    first = np.uint64(domains.start[i])
+    for k in range(first, first + np.uint64(domains.used[i])):
+        q = _U3 * np.uint64(k)
+        force = plus_product(product(px, spread(vectors[q])), py, spread(vectors[q + _U1]))
+        force = plus_product(force, pz, spread(vectors[q + _U2]))
+        add_three(f, np.uint64(domains.columns[k]), force)
 
 
 @njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
 def _average(domains, u, i, lane, chunk, unit):
     """Puts the averaged gradient of a node in a lane."""
     L = LANES
-    h0 = h1 = h2 = h3 = h4 = h5 = h6 = h7 = h8 = 0.0
-    first = np.uint64(domains.start[i])
-    columns, vectors = domains.columns, domains.vectors
-    for k in range(first, first + np.uint64(domains.used[i])):
-        j = np.uint64(columns[k])
-        q = _U3 * np.uint64(k)
-        a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
-        x, y, z = u[j], u[j + _U1], u[j + _U2]
-        h0 += x * a
-        h1 += x * b
-        h2 += x * c
-        h3 += y * a
-        h4 += y * b
-        h5 += y * c
-        h6 += z * a
-        h7 += z * b
-        h8 += z * c
-    chunk[lane], chunk[lane + L], chunk[lane + 2 * L] = unit + h0, h1, h2
-    chunk[lane + 3 * L], chunk[lane + 4 * L], chunk[lane + 5 * L] = h3, unit + h4, h5
-    chunk[lane + 6 * L], chunk[lane + 7 * L], chunk[lane + 8 * L] = h6, h7, unit + h8
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = _gradient(domains, u, i)
+    chunk[lane], chunk[lane + L], chunk[lane + 2 * L] = unit + xx, xy, xz
+    chunk[lane + 3 * L], chunk[lane + 4 * L], chunk[lane + 5 * L] = yx, unit + yy, yz
+    chunk[lane + 6 * L], chunk[lane + 7 * L], chunk[lane + 8 * L] = zx, zy, unit + zz
     chunk[lane + SHEAR * L] = 2.0 * domains.lame[1] * domains.volume[i]
     chunk[lane + VOLUMETRIC * L] = domains.lame[0] * domains.volume[i]
     for k in range(4):
@@ -158,21 +180,13 @@ def _average(domains, u, i, lane, chunk, unit):
 
 
 @njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
-def _spread(domains, i, lane, chunk, f):
+def _distribute(domains, i, lane, chunk, f):
     """Adds the forces V P G_ij of a lane over the row of a node."""
     L = LANES
-    p0, p1, p2 = chunk[lane], chunk[lane + L], chunk[lane + 2 * L]
-    p3, p4, p5 = chunk[lane + 3 * L], chunk[lane + 4 * L], chunk[lane + 5 * L]
-    p6, p7, p8 = chunk[lane + 6 * L], chunk[lane + 7 * L], chunk[lane + 8 * L]
-    first = np.uint64(domains.start[i])
-    columns, vectors = domains.columns, domains.vectors
-    for k in range(first, first + np.uint64(domains.used[i])):
-        j = np.uint64(columns[k])
-        q = _U3 * np.uint64(k)
-        a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
-        f[j] += p0 * a + p1 * b + p2 * c
-        f[j + _U1] += p3 * a + p4 * b + p5 * c
-        f[j + _U2] += p6 * a + p7 * b + p8 * c
+    px = three(chunk[lane], chunk[lane + 3 * L], chunk[lane + 6 * L])
+    py = three(chunk[lane + L], chunk[lane + 4 * L], chunk[lane + 7 * L])
+    pz = three(chunk[lane + 2 * L], chunk[lane + 5 * L], chunk[lane + 8 * L])
+    _add_forces(domains, i, px, py, pz, f)
 
 
 @njit(cache=True, fastmath=ORDERED_MATH, error_model='numpy')
@@ -185,37 +199,19 @@ def add_still_domains(domains, awake, u, f):
         u: displacement by coordinate [m], shape (3 n,).
         f: added to [N], shape (3 n,).
     """
-    columns, vectors = domains.columns, domains.vectors
     for s in range(awake.shape[0]):
         for i in range(awake[s, 0], min(domains.used.shape[0], awake[s, 1])):
-            xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
-            first = np.uint64(domains.start[i])
-            for k in range(first, first + np.uint64(domains.used[i])):
-                j = np.uint64(columns[k])
-                q = _U3 * np.uint64(k)
-                a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
-                x, y, z = u[j], u[j + _U1], u[j + _U2]
-                xx += x * a
-                xy += x * b
-                xz += x * c
-                yx += y * a
-                yy += y * b
-                yz += y * c
-                zx += z * a
-                zy += z * b
-                zz += z * c
+            here = _U3 * np.uint64(domains.start[i])
+            for q in range(here, here + _U3 * np.uint64(domains.used[i]), _LINE):
+                prefetch(domains.vectors, q + _AHEAD)
+            (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = _gradient(domains, u, i)
             shear = domains.lame[1] * domains.volume[i]
             pressure = domains.lame[0] * domains.volume[i] * (xx + yy + zz)
             xx, yy = 2.0 * shear * xx + pressure, 2.0 * shear * yy + pressure
             zz = 2.0 * shear * zz + pressure
             xy, xz, yz = shear * (xy + yx), shear * (xz + zx), shear * (yz + zy)
-            for k in range(first, first + np.uint64(domains.used[i])):
-                j = np.uint64(columns[k])
-                q = _U3 * np.uint64(k)
-                a, b, c = vectors[q], vectors[q + _U1], vectors[q + _U2]
-                f[j] += xx * a + xy * b + xz * c
-                f[j + _U1] += xy * a + yy * b + yz * c
-                f[j + _U2] += xz * a + yz * b + zz * c
+            columns = three(xx, xy, xz), three(xy, yy, yz), three(xz, yz, zz)
+            _add_forces(domains, i, *columns, f)
 
 
 @njit(cache=True, error_model='numpy')
@@ -254,7 +250,7 @@ def add_domains(domains, awake, u, f, turns, unit):
             stress(chunk, unit)
             for i in range(low, high):
                 energy += chunk[i - low + ENERGY * LANES]
-                _spread(domains, i, i - low, chunk, f)
+                _distribute(domains, i, i - low, chunk, f)
     return energy
 
 
@@ -322,7 +318,7 @@ class NodeDomains:
                 return
             nodes = nodes[full:]
             d = self._domains
-            size = int(self._filled[0]) + longer(int(d.room[nodes[0]]))
+            size = int(self._filled[0]) + longer.py_func(int(d.room[nodes[0]])) + 1
             columns = grown(d.columns, size)
             self._domains = d._replace(columns=columns, vectors=grown(d.vectors, 3 * len(columns)))
 

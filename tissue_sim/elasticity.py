@@ -29,7 +29,7 @@ from tissue_sim.material import Material
 from tissue_sim.mesh import TetMesh, Touched, grown
 from tissue_sim.rings import Neighbours, chunks_around, intervals, nodes_of_chunks
 from tissue_sim.rotation import LANES
-from tissue_sim.tensor_mass import Rows, TensorMass, add_rows, shape_gradients
+from tissue_sim.tensor_mass import Rows, TensorMass, put_rows, shape_gradients
 
 ModelName = Literal['linear', 'linear_smoothed', 'corotational', 'corotational_smoothed']
 MODELS: tuple[ModelName, ...] = get_args(ModelName)
@@ -79,6 +79,17 @@ class Part(NamedTuple):
 
 
 @njit(cache=True, error_model='numpy')
+def _begin(operands, u, f):
+    """Puts the forces of the tensors in all of reach, 0 where they have none."""
+    rows, awake, reach = operands.rows, operands.awake, operands.reach
+    n = rows.used.shape[0]
+    if n == 0 or awake.shape[0] != 1 or awake[0, 1] - awake[0, 0] < n:
+        for s in range(reach.shape[0]):
+            f[3 * reach[s, 0] : 3 * reach[s, 1]] = 0.0
+    put_rows(rows, awake, u, f)
+
+
+@njit(cache=True, error_model='numpy')
 def internal_force(operands, u, f, turns):
     """Elastic force that resists a displacement.
 
@@ -95,9 +106,7 @@ def internal_force(operands, u, f, turns):
     if operands.local.first.shape[0] > 0:
         local_product(operands.local, u, f)
         return 0.0
-    for s in range(operands.reach.shape[0]):
-        f[3 * operands.reach[s, 0] : 3 * operands.reach[s, 1]] = 0.0
-    add_rows(operands.rows, operands.awake, u, f)
+    _begin(operands, u, f)
     energy = 0.0
     if operands.domains.used.shape[0] > 0 and not operands.rotating:
         add_still_domains(operands.domains, operands.awake, u, f)
@@ -117,9 +126,7 @@ def stiffness_product(operands, x, f):
         x: by coordinate, shape (3 n,).
         f: output, shape (3 n,).
     """
-    for s in range(operands.reach.shape[0]):
-        f[3 * operands.reach[s, 0] : 3 * operands.reach[s, 1]] = 0.0
-    add_rows(operands.rows, operands.awake, x, f)
+    _begin(operands, x, f)
     if operands.domains.used.shape[0] > 0 and not operands.rotating:
         add_still_domains(operands.domains, operands.awake, x, f)
     elif operands.domains.used.shape[0] > 0:
@@ -196,7 +203,7 @@ def assembled_norms(tensors, links, nodes, norms):
                     if seen[k] == other:
                         new = False
                 if new:
-                    total += _edge_norm(tensors, min(node, other), max(node, other))
+                    total += _edge_norm(tensors, max(node, other), min(node, other))
                     if number < 256:
                         seen[number] = other
                         number += 1
@@ -205,9 +212,9 @@ def assembled_norms(tensors, links, nodes, norms):
 
 
 @njit(cache=True)
-def _edge_norm(tensors, low, high):
-    for slot in range(tensors.start[low], tensors.start[low] + tensors.used[low]):
-        if tensors.columns[slot] == 3 * high:
+def _edge_norm(tensors, high, low):
+    for slot in range(tensors.start[high], tensors.start[high] + tensors.used[high]):
+        if tensors.columns[slot] == 3 * low:
             square = 0.0
             for i in range(9):
                 square += tensors.blocks[9 * slot + i] ** 2

@@ -26,15 +26,13 @@ def _ahead(q, u, v, beta):
 
 
 @njit(cache=True, error_model='numpy')
-def _move(u, v, dt):
+def _euler(u, v, q, f, inverse_mass, alpha, beta, dt, symplectic):
+    """A step, and q = u + beta v for the next, while all of it is in the cache."""
     for i in range(u.shape[0]):
-        u[i] += dt * v[i]
-
-
-@njit(cache=True, error_model='numpy')
-def _accelerate(v, f, inverse_mass, alpha, dt):
-    for i in range(v.shape[0]):
-        v[i] += dt * (-f[i] * inverse_mass[i] - alpha * v[i])
+        before = v[i]
+        after = before + dt * (-f[i] * inverse_mass[i] - alpha * before)
+        place = u[i] + dt * (after if symplectic else before)
+        u[i], v[i], q[i] = place, after, place + beta * after
 
 
 @njit(cache=True, error_model='numpy')
@@ -78,10 +76,10 @@ def euler_steps(
     force, last = np.zeros(3), np.zeros((2, 3))
     done = start_of_work(spring, u, last)
     _copy(operands.reach, u, q)
+    for s in range(spans.shape[0]):
+        a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+        _ahead(q[a:b], u[a:b], v[a:b], beta)
     for step in range(first, first + steps):
-        for s in range(spans.shape[0]):
-            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-            _ahead(q[a:b], u[a:b], v[a:b], beta)
         internal_force(operands, q, f, 1)
         if spring.mode != 0:
             subtract_spring(spring, step / total, held, f, force)
@@ -91,11 +89,7 @@ def euler_steps(
             done += spring_work(spring, force, u, last)
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-            if not symplectic:
-                _move(u[a:b], v[a:b], dt)
-            _accelerate(v[a:b], f[a:b], inverse_mass[a:b], alpha, dt)
-            if symplectic:
-                _move(u[a:b], v[a:b], dt)
+            _euler(u[a:b], v[a:b], q[a:b], f[a:b], inverse_mass[a:b], alpha, beta, dt, symplectic)
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)

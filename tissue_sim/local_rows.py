@@ -11,6 +11,15 @@ import numpy as np
 from numba import njit
 
 from tissue_sim.coupling import Spring
+from tissue_sim.simd import (
+    load_four,
+    load_three,
+    plus_product,
+    put_three,
+    spread,
+    three,
+    total,
+)
 from tissue_sim.tensor_mass import Rows
 
 LARGEST = 2000
@@ -23,7 +32,8 @@ class LocalRows(NamedTuple):
     Attributes:
         first: first slot of each row, and the end of the last, shape (a + 1,); (0,): no rows.
         columns: three times the local node of each tensor, shape (c,).
-        blocks: tensors K_ij [N/m], row-major, node tensors among them, shape (9 c,).
+        blocks: tensors K_ij [N/m], row-major, node tensors among them, and a number that is read
+            with the last three, shape (9 c + 1,).
     """
 
     first: np.ndarray
@@ -94,7 +104,8 @@ def _gather(rows, around, local, count):
     for i in range(count):
         first[i + 1] += first[i]
     end = first[:count].copy()
-    columns, blocks = np.empty(first[count], np.uint32), np.empty(9 * first[count])
+    columns, blocks = np.empty(first[count], np.uint32), np.empty(9 * first[count] + 1)
+    blocks[-1] = 0.0
     for node in around:
         i = local[node]
         if i < count:
@@ -120,8 +131,7 @@ def _gather(rows, around, local, count):
     return first, columns, blocks
 
 
-_U1, _U2, _U3, _U4 = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
-_U5, _U6, _U7, _U8, _U9 = (np.uint64(i) for i in (5, 6, 7, 8, 9))
+_U3, _U6, _U9 = (np.uint64(i) for i in (3, 6, 9))
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
@@ -135,12 +145,10 @@ def local_product(rows, u, f):
     """
     first, columns, blocks = rows.first, rows.columns, rows.blocks
     for i in range(first.shape[0] - 1):
-        a0 = a1 = a2 = 0.0
+        a0 = a1 = a2 = spread(0.0)
         for k in range(np.uint64(first[i]), np.uint64(first[i + 1])):
-            j, q = np.uint64(columns[k]), _U9 * k
-            x, y, z = u[j], u[j + _U1], u[j + _U2]
-            a0 += blocks[q] * x + blocks[q + _U1] * y + blocks[q + _U2] * z
-            a1 += blocks[q + _U3] * x + blocks[q + _U4] * y + blocks[q + _U5] * z
-            a2 += blocks[q + _U6] * x + blocks[q + _U7] * y + blocks[q + _U8] * z
-        row = _U3 * np.uint64(i)
-        f[row], f[row + _U1], f[row + _U2] = a0, a1, a2
+            there, q = load_three(u, np.uint64(columns[k])), _U9 * k
+            a0 = plus_product(a0, load_four(blocks, q), there)
+            a1 = plus_product(a1, load_four(blocks, q + _U3), there)
+            a2 = plus_product(a2, load_four(blocks, q + _U6), there)
+        put_three(f, _U3 * np.uint64(i), three(total(a0), total(a1), total(a2)))

@@ -1,8 +1,10 @@
 """The tensor-mass method: node and edge tensors gathered from the stars of the nodes.
 
 Cotin 2000; thesis 4.3. The stiffness is kept as the symmetric 3x3 tensor of each node and the
-tensor of each edge (i, j), i < j, in the row of i; the transpose serves row j. Rows lie packed, as
-what lies between them is loaded with them; one that a cut makes longer moves behind the last.
+tensor of each edge (i, j), j < i, in the row of i; the transpose serves row j. So, row after row,
+the force on a node is put first and added to later: nothing has to be set to 0 before. Rows lie
+packed, as what lies between them is loaded with them; one that a cut makes longer moves behind the
+last.
 """
 
 from typing import NamedTuple
@@ -11,6 +13,18 @@ import numpy as np
 from numba import njit
 
 from tissue_sim.mesh import TetMesh, grown
+from tissue_sim.simd import (
+    add_three,
+    load_four,
+    load_three,
+    plus_product,
+    prefetch,
+    product,
+    put_three,
+    spread,
+    three,
+    total,
+)
 
 
 class Tensors(NamedTuple):
@@ -19,7 +33,7 @@ class Tensors(NamedTuple):
     Attributes:
         diagonal: node tensors [N/m], xx xy xz yy yz zz, shape (n, 6).
         start, used, room: first slot, used slots and slots of each row, shape (n,).
-        columns: three times the node j of each edge tensor, shape (c,).
+        columns: three times the node j of each edge tensor; some beyond the last row, shape (c,).
         blocks: edge tensors K_ij [N/m], row-major, shape (9 c,).
     """
 
@@ -32,7 +46,7 @@ class Tensors(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What `add_rows` takes of `Tensors`, for the nodes there are, `diagonal` flat."""
+    """What `put_rows` takes of `Tensors`, for the nodes there are, `diagonal` flat."""
 
     start: np.ndarray
     used: np.ndarray
@@ -94,7 +108,7 @@ def move_row(start, used, room, columns, values, filled, node):
     """
     width = values.shape[0] // columns.shape[0]
     size, at, first = longer(room[node]), filled[0], start[node]
-    if at + size > columns.shape[0]:
+    if at + size >= columns.shape[0]:  # one to spare: see `put_rows`
         return False
     for k in range(used[node]):
         columns[at + k] = columns[first + k]
@@ -211,7 +225,7 @@ def gather_rows(tensors, filled, links, rest, nodes, lame_lambda, lame_mu):
             tensors.diagonal[node, 5] += both * g[a, 2] * g[a, 2] + dot
             for b in range(4):
                 other = links.tetrahedra[tet, b]
-                if other > node:
+                if other < node:
                     slot = _edge_slot(tensors, filled, node, 3 * other)
                     if slot < 0:
                         return which
@@ -226,54 +240,57 @@ def gather_rows(tensors, filled, links, rest, nodes, lame_lambda, lame_mu):
     return -1
 
 
-_U1, _U2, _U3, _U6, _U9 = (np.uint64(i) for i in (1, 2, 3, 6, 9))
-_U4, _U5, _U7, _U8 = (np.uint64(i) for i in (4, 5, 7, 8))
+_AHEAD = np.uint64(9 * 128)
+"""Numbers by which `put_rows` asks memory for blocks beforehand: 9 kB, a quarter of the first
+cache. Of 200,000 tetrahedra, which the second does not hold, it takes half the time so."""
+_U1, _U2, _U3, _U4, _U5, _U6, _U9 = (np.uint64(i) for i in (1, 2, 3, 4, 5, 6, 9))
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
-def add_rows(rows, awake, u, f):
-    """Adds the product K u with the symmetric halves of K.
+def put_rows(rows, awake, u, f):
+    """Puts the product K u with the symmetric halves of K.
 
-    Unsigned indices: a sign test for each access costs a third.
+    Unsigned indices: a sign test for each access costs a third. The arrays are longer than their
+    rows: the last three numbers are read as four.
 
     Args:
         rows: see `Rows`.
-        awake: intervals of nodes whose rows count, shape (s, 2).
+        awake: intervals of nodes whose rows count, ascending, shape (s, 2).
         u: displacement by coordinate [m], shape (3 n,).
-        f: added to [N], shape (3 n,).
+        f: output [N], put at these nodes and added to at their neighbours, shape (3 n,).
     """
     start, used, columns = rows.start, rows.used, rows.columns
     blocks, diagonal = rows.blocks, rows.diagonal
     for s in range(awake.shape[0]):
-        _add_interval(start, used, columns, blocks, diagonal, awake[s, 0], awake[s, 1], u, f)
+        _put_interval(start, used, columns, blocks, diagonal, awake[s, 0], awake[s, 1], u, f)
 
 
 @njit(cache=True, fastmath=True, error_model='numpy')
-def _add_interval(start, used, columns, blocks, diagonal, low, high, u, f):
+def _put_interval(start, used, columns, blocks, diagonal, low, high, u, f):
     for i in range(low, min(high, used.shape[0])):
         row = _U3 * np.uint64(i)
-        x0, y0, w0 = u[row], u[row + _U1], u[row + _U2]
+        x, y, z = u[row], u[row + _U1], u[row + _U2]
         q = _U6 * np.uint64(i)
-        a0 = diagonal[q] * x0 + diagonal[q + _U1] * y0 + diagonal[q + _U2] * w0
-        a1 = diagonal[q + _U1] * x0 + diagonal[q + _U3] * y0 + diagonal[q + _U4] * w0
-        a2 = diagonal[q + _U2] * x0 + diagonal[q + _U4] * y0 + diagonal[q + _U5] * w0
+        xx, xy, xz = diagonal[q], diagonal[q + _U1], diagonal[q + _U2]
+        yy, yz, zz = diagonal[q + _U3], diagonal[q + _U4], diagonal[q + _U5]
+        own_x = xx * x + xy * y + xz * z
+        own_y = xy * x + yy * y + yz * z
+        own_z = xz * x + yz * y + zz * z
+        xs, ys, zs = spread(x), spread(y), spread(z)
+        a0 = a1 = a2 = spread(0.0)
         first = np.uint64(start[i])
         for k in range(first, first + np.uint64(used[i])):
             j = np.uint64(columns[k])
             q = _U9 * np.uint64(k)
-            b0, b1, b2 = blocks[q], blocks[q + _U1], blocks[q + _U2]
-            b3, b4, b5 = blocks[q + _U3], blocks[q + _U4], blocks[q + _U5]
-            b6, b7, b8 = blocks[q + _U6], blocks[q + _U7], blocks[q + _U8]
-            x, y, w = u[j], u[j + _U1], u[j + _U2]
-            a0 += b0 * x + b1 * y + b2 * w
-            a1 += b3 * x + b4 * y + b5 * w
-            a2 += b6 * x + b7 * y + b8 * w
-            f[j] += b0 * x0 + b3 * y0 + b6 * w0
-            f[j + _U1] += b1 * x0 + b4 * y0 + b7 * w0
-            f[j + _U2] += b2 * x0 + b5 * y0 + b8 * w0
-        f[row] += a0
-        f[row + _U1] += a1
-        f[row + _U2] += a2
+            prefetch(blocks, q + _AHEAD)
+            # Rows of the tensor, and in the lane to spare the first number of the next.
+            b0, b1 = load_four(blocks, q), load_four(blocks, q + _U3)
+            b2, there = load_four(blocks, q + _U6), load_three(u, j)
+            a0 = plus_product(a0, b0, there)
+            a1 = plus_product(a1, b1, there)
+            a2 = plus_product(a2, b2, there)
+            add_three(f, j, plus_product(plus_product(product(b0, xs), b1, ys), b2, zs))
+        put_three(f, row, three(own_x + total(a0), own_y + total(a1), own_z + total(a2)))
 
 
 class TensorMass:
@@ -292,7 +309,7 @@ class TensorMass:
         tets = np.sort(self._mesh.tetrahedra, axis=1).astype(np.int64)
         pairs = np.concatenate([tets[:, [i, j]] for i in range(4) for j in range(i + 1, 4)])
         edges = np.unique(pairs[:, 0] * n + pairs[:, 1])
-        room += np.bincount(edges // n, minlength=n)
+        room += np.bincount(edges % n, minlength=n)
         start = np.concatenate([[0], np.cumsum(room)[:-1]])
         slots = int(room.sum())
         # Spare room, which costs nothing until it is used: no cut has to move it all.
@@ -341,13 +358,13 @@ class TensorMass:
                 return
             remaining = remaining[full:]
             t = self.tensors
-            size = int(self._filled[0]) + longer(int(t.room[remaining[0]]))
+            size = int(self._filled[0]) + longer.py_func(int(t.room[remaining[0]])) + 1
             columns = grown(t.columns, size)
             self.tensors = t._replace(columns=columns, blocks=grown(t.blocks, 9 * len(columns)))
 
     @property
     def operands(self) -> Rows:
-        """What `add_rows` takes."""
+        """What `put_rows` takes."""
         n = self._mesh.node_count
         t = self.tensors
         return Rows(t.start[:n], t.used[:n], t.columns, t.blocks, t.diagonal[:n].ravel())

@@ -61,11 +61,12 @@ def moved_bytes(model: ElasticModel) -> int:
     """What one force evaluation has to read and write, each array once: the bytes model.
 
     A slot of the tensors is 9 numbers and a column, one of the domains 3 and a column; a node has
-    its diagonal or volume, the places of its row, u read, f set to 0, read and written. A
-    corotational element has 15 numbers and 4 corners, and its rotation is written.
+    its diagonal or volume, the places of its row, u read, f read and written, and set to 0 where
+    there are no tensors. A corotational element has 15 numbers and 4 corners, and its rotation is
+    written.
     """
     operands, n = model.operands(), model.mesh.node_count
-    total = n * 24 * 4
+    total = n * 24 * (3 if len(operands.rows.used) else 4)
     if len(operands.rows.used):
         total += int(operands.rows.used.sum()) * 76 + n * 64
     if len(operands.domains.used):
