@@ -114,6 +114,28 @@ def test_frames_that_need_shorter_steps_one_after_another_do_not_get_longer_with
     assert any(frame.diverged for frame in frames)
 
 
+@pytest.mark.parametrize(
+    ('name', 'integrator', 'most'),
+    [('linear', 'rk4', 5), ('linear', 'implicit', 21), ('corotational', 'rk4', 21)],
+)
+def test_a_frame_that_is_taken_back_costs_so_many_frames_at_most(
+    name: ModelName, integrator: IntegratorName, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps far below what is stable whatever the shape would mend nothing, and delay the rest."""
+    tissue = simulation(name, integrator)
+    usual, spent = tissue.frame(None).substeps, []
+    integrate = Dynamics._integrate
+
+    def counted(dynamics: Dynamics, coupling: Coupling, dt: float, substeps: int) -> float:
+        spent.append(substeps)
+        return integrate(dynamics, coupling, dt, substeps)
+
+    monkeypatch.setattr(Dynamics, '_integrate', counted)
+    monkeypatch.setattr(Guard, 'trouble', lambda *_: 'it diverges')
+    assert tissue.frame(None).diverged
+    assert sum(spent) == most * usual
+
+
 def test_forward_euler_without_damping_is_refused_in_words() -> None:
     nodes, tets = box((2, 2, 2), 0.01)
     mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
