@@ -14,6 +14,7 @@ from haptic_bridge.force_path import ForcePath
 from haptic_bridge.hand import compile_script
 from session.errors import SessionError
 from session.in_process import InProcess, Tissue
+from session.measure.chart_meshes import kuhn_block
 from session.organs import mesher
 from session.organs.import_mesh import SIDES, ImportOptions, import_mesh
 from session.organs.imported_scene import height
@@ -229,6 +230,21 @@ def test_mesher_that_dies_is_an_error_and_not_the_end(
     monkeypatch.setattr(subprocess, 'run', die)
     with pytest.raises(SessionError, match='out of cheese; try another --edge'):
         mesher.fill(BODY.vertices * 1e-3, BODY.faces, 0.009, 0.001)
+
+
+def test_mesh_is_numbered_so_that_neighbours_lie_near_one_another() -> None:
+    mesh, random = kuhn_block((12, 12, 12), (0.1, 0.1, 0.1)), np.random.default_rng(0)
+    n, order = mesh.node_count, random.permutation(mesh.node_count)
+    shuffled = random.permutation(np.argsort(order)[mesh.tetrahedra].astype(np.int32))
+    nodes, tetrahedra = mesher.near_together(mesh.rest[order], shuffled)
+    assert np.array_equal(np.unique(nodes, axis=0), np.unique(mesh.rest, axis=0))
+    before, after = mesh.rest[order][shuffled], nodes[tetrahedra]
+    ours, theirs = after.mean(axis=1), before.mean(axis=1)  # no two are alike
+    same = np.lexsort(ours.T), np.lexsort(theirs.T)
+    assert np.array_equal(after[same[0]], before[same[1]])
+    assert np.ptp(shuffled, axis=1).max() > 0.9 * n
+    assert np.ptp(tetrahedra, axis=1).max() < 4 * 13**2  # of 13^3: some layers
+    assert (np.diff(tetrahedra.min(axis=1)) >= 0).all()
 
 
 @pytest.fixture(scope='module')

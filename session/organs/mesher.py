@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from session.errors import SessionError
 from tissue_sim.errors import MeshError
@@ -66,13 +68,34 @@ def fill(
             with np.load(made) as solid:
                 nodes, tetrahedra = solid['nodes'], solid['tetrahedra']
             try:
-                return nodes, check_mesh(nodes, tetrahedra)
+                return near_together(nodes, check_mesh(nodes, tetrahedra))
             except MeshError as error:
                 reason = str(error)
     raise SessionError(
         f'no mesh could be made with edges of {1e3 * edge:.3g} mm: {reason}; try another --edge, '
         'or smooth and simplify the surface'
     )
+
+
+def near_together(
+    nodes: NDArray[np.float64], tetrahedra: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """The same mesh, numbered so that neighbours lie near one another in memory.
+
+    By the reverse Cuthill-McKee method, tetrahedra by their first node. A mesher's own order costs
+    a force of 150,000 tetrahedra a quarter to a half more.
+
+    Args:
+        nodes: [m], shape (n, 3).
+        tetrahedra: shape (m, 4).
+    """
+    pairs = np.repeat(tetrahedra, 4, axis=1).ravel(), np.tile(tetrahedra, 4).ravel()
+    graph = csr_matrix((np.ones(len(pairs[0]), np.int8), pairs), shape=2 * (len(nodes),))
+    order = reverse_cuthill_mckee(graph, symmetric_mode=True)
+    number = np.empty(len(nodes), np.int32)
+    number[order] = np.arange(len(nodes), dtype=np.int32)
+    corners = number[tetrahedra]
+    return nodes[order], corners[np.argsort(corners.min(axis=1), kind='stable')]
 
 
 def _run(given: str, made: str) -> None:
