@@ -134,8 +134,12 @@ class FaultyWorld(World):
         values[ForceSampleCodec.fields['resistance'].start] = resistance
         return ForceSampleCodec(frame).encode(sample.stamp_ns, values)
 
-    def press(self) -> None:
-        """Presses from above, and waits until the hand feels the tissue steadily."""
+    def press(self, again: int = 3) -> None:
+        """Presses from above, and waits until the hand feels the tissue steadily.
+
+        Where the machine kept this test from sending for 20 ms meanwhile, the bridge is in FAULT,
+        as it should be: then once more from above.
+        """
         asked = len(self.record.states)
         if self.record.states[-1][1] == 'FAULT':
             self.command.publish(self.message(string='enable'))
@@ -150,6 +154,11 @@ class FaultyWorld(World):
         self.move(PRESSED, 0.2)
         deadline = time.monotonic() + 20.0
         while not self.is_steady():
+            if again and self.record.states[-1][1] == 'FAULT':
+                self.lift()
+                time.sleep(0.3)  # a new pose that is right must have come before enable
+                self.press(again - 1)
+                return
             assert time.monotonic() < deadline, 'the force did not come back'
             time.sleep(0.02)
 
