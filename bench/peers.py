@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ from rich.table import Table
 
 from bench.peer_beam import Beam, Result, Solver, make_beam, measure, stable_step
 from bench.peer_solvers import MujocoFlex, NewtonTetrahedra
+from session.measure.bench_clock import keep
 from session.measure.chart_problems import material
 from tissue_sim.coupling import Coupling
 from tissue_sim.elasticity import MODELS, ElasticModel, ModelName
@@ -242,9 +242,7 @@ def main() -> None:
     else:
         Console(width=None if sys.stdout.isatty() else 200).print(table(rows))
     if asked.save:
-        folder = Path(__file__).parent / 'results'
-        folder.mkdir(exist_ok=True)
-        (folder / f'{report["when"]}-peers.json').write_text(json.dumps(report, indent=1) + '\n')
+        keep(report, 'peers')
 
 
 if __name__ == '__main__':

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from session.errors import SessionError
-from session.measure.bench_clock import Figure, by_turns, figure, stream
+from session.measure.bench_clock import Figure, by_turns, figure, keep, stream
 from session.measure.bench_cut import cut
 from session.measure.bench_flow import codec, session
 from session.measure.bench_frame import frame
@@ -73,10 +73,7 @@ def run_bench(names: list[Bench], sizes: list[int], *, as_json: bool, save: bool
         for name, rows in found.items():
             console.print(_table(name, rows))
     if save:
-        folder = Path(__file__).parents[2] / 'bench' / 'results'
-        folder.mkdir(exist_ok=True)
-        target = folder / f'{report["when"]}-{"-".join(wanted)}.json'
-        target.write_text(json.dumps(report, indent=1) + '\n')
+        target = keep(report, '-'.join(wanted))
         Console(stderr=True).print(f'saved to {target}', highlight=False)
 
 

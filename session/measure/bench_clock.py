@@ -1,8 +1,11 @@
 """How `bench` measures: a thread's processor time, by turns, beside what memory can stream."""
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -79,3 +82,20 @@ def stream(size: float) -> Callable[[], object]:
     """The yardstick: a task that reads so many bytes of memory in their order."""
     values = np.ones(max(int(size) // 8, 1))
     return lambda: _read(values)
+
+
+def keep(report: dict[str, Any], of: str) -> Path:
+    """Writes what was measured to bench/results, under its time and what it is of.
+
+    Args:
+        report: plain values, `when` among them (ISO 8601).
+        of: what was measured.
+
+    Returns:
+        The file; without colons, which not every system takes in a name.
+    """
+    folder = Path(__file__).parents[2] / 'bench' / 'results'
+    folder.mkdir(exist_ok=True)
+    target = folder / f'{report["when"]}-{of}.json'.replace(':', '')
+    target.write_text(json.dumps(report, indent=1) + '\n')
+    return target

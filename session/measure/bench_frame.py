@@ -12,6 +12,7 @@ import numpy as np
 
 from cutting.methods import make_method
 from cutting.settings import CuttingSettings
+from cutting.warm_up import warm_up as warm_up_cutting
 from session.measure.bench_clock import Figure, figure
 from session.measure.bench_strokes import blade_contact
 from session.measure.bench_tissue import SIZE, box, edge_of, liver_material
@@ -24,6 +25,7 @@ from tissue_sim.dynamics import TimeStepping
 from tissue_sim.material import Material
 from tissue_sim.messages import DeltaEncoder, force_message, mesh_message
 from tissue_sim.simulation import TissueSimulation
+from tissue_sim.warm_up import warm_up
 
 BUDGET = 1e3 / 30
 """[ms] of a frame."""
@@ -43,6 +45,8 @@ def frame(sizes: list[int], frames: int = 300) -> list[Figure]:
         sizes: in tetrahedra.
         frames: of each load, after some that warm up.
     """
+    warm_up()  # as the nodes do before a session
+    warm_up_cutting(CuttingSettings())
     figures: list[Figure] = []
     for size in sizes:
         regions = [0] if size <= _WHOLE else [0, 1000] if size <= _LARGE else [500, 1000]
