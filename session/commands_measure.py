@@ -63,11 +63,14 @@ def bench(
     save: Annotated[
         bool, typer.Option('--save', help='Keep the figures in bench/results.')
     ] = False,
+    against: Annotated[
+        Path | None, typer.Option(help='File of an earlier run: its figures stand beside.')
+    ] = None,
 ) -> None:
     """Measure what force, step, frame, cut, proxy, messages, session and start cost here."""
     from session.measure.bench import run_bench
 
-    run_bench(names or [], size or [], as_json=as_json, save=save)
+    run_bench(names or [], size or [], as_json=as_json, save=save, against=against)
 
 
 @commands.command('bench-scaling', epilog=EXIT_STATUSES)

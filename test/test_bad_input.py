@@ -347,6 +347,7 @@ COMMANDS = [
     words('', 'run', 'name a program', './trainer run python'),
     words('', 'run {}/nothing', '{}/nothing', 'no such file', 'name a program that is there'),
     words('', 'probe-device --profile tuch', 'tuch', 'did you mean touch?'),
+    words('', 'bench cut --against {}/then.json', '{}/then.json', 'No such file', 'bench --save'),
     words('', 'bench-timing --seconds 1', '--seconds', "'1'", 'equal to 5'),
     words('', 'fuzz-cuts --method tear', 'tear', 'combined'),
 ]

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,37 @@ def test_each_benchmark_gives_sound_figures_as_json(
 def test_a_size_for_a_benchmark_that_has_none_is_refused() -> None:
     with pytest.raises(SessionError, match='has no size'):
         bench.run_bench([Bench.START], [300], as_json=True, save=False)
+
+
+def test_an_earlier_run_stands_beside_a_new_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names, file = [Bench.CUT], tmp_path / 'then.json'
+    bench.run_bench(names, [300], as_json=True, save=False)
+    then = json.loads(capsys.readouterr().out)
+    row = then['figures']['cut'][0]
+    row['median'], row['ratio'], row['against'] = 77.25, 12.5, 'something'
+    then['machine']['processor'] = 'Abacus'
+    file.write_text(json.dumps(then))
+    bench.run_bench(names, [300], as_json=False, save=False, against=file)
+    said = capsys.readouterr().out
+    line = next(line for line in said.splitlines() if row['name'] in line)
+    assert line.split()[-2:] == ['77.25', '12.50']
+    assert 'median then' in said and 'processor Abacus, now' in said and then['when'] in said
+    bench.run_bench(names, [300], as_json=True, save=False, against=file)
+    assert json.loads(capsys.readouterr().out)['against'] == then
+
+
+@pytest.mark.parametrize(
+    ('words', 'wrong'), [('{"rows": []}', 'when: Field required'), ('nothing', 'Invalid JSON')]
+)
+def test_a_file_that_is_no_earlier_run_is_refused_before_anything_is_measured(
+    words: str, wrong: str, tmp_path: Path
+) -> None:
+    file = tmp_path / 'rows.json'
+    file.write_text(words)
+    with pytest.raises(SessionError, match=f'rows.json is not of a run of bench: {wrong}'):
+        bench.run_bench([Bench.START], [], as_json=True, save=True, against=file)
 
 
 def test_a_box_has_about_as_many_tetrahedra_as_it_is_asked_for() -> None:

@@ -2,13 +2,15 @@
 
 import json
 import platform
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numba
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 from rich import box as borders
 from rich.console import Console
 from rich.table import Table
@@ -39,7 +41,24 @@ BENCHES: dict[Bench, tuple[Callable[..., list[Figure]], list[int]]] = {
 """Each with the sizes that it runs at unless it is told; those without any have one."""
 
 
-def run_bench(names: list[Bench], sizes: list[int], *, as_json: bool, save: bool) -> None:
+@dataclass(frozen=True)
+class Report:
+    """What a run of `bench` has found.
+
+    Attributes:
+        when: its end (ISO 8601).
+        machine: processor and versions, by name.
+        figures: by benchmark, that of the memory first.
+    """
+
+    when: str
+    machine: dict[str, str]
+    figures: dict[str, list[Figure]]
+
+
+def run_bench(
+    names: list[Bench], sizes: list[int], *, as_json: bool, save: bool, against: Path | None = None
+) -> None:
     """Measures, prints, and keeps the figures if it is told to.
 
     Args:
@@ -47,9 +66,10 @@ def run_bench(names: list[Bench], sizes: list[int], *, as_json: bool, save: bool
         sizes: in tetrahedra; none: each benchmark's own.
         as_json: print JSON.
         save: write the same JSON to bench/results.
+        against: the file of an earlier run, whose figures are printed beside.
 
     Raises:
-        SessionError: sizes were given to a benchmark that has none.
+        SessionError: sizes were given to a benchmark that has none, or the file is not of a run.
     """
     wanted = list(dict.fromkeys(names)) or list(Bench)
     if sizes and names and all(not BENCHES[name][1] for name in wanted):
@@ -57,24 +77,43 @@ def run_bench(names: list[Bench], sizes: list[int], *, as_json: bool, save: bool
             f'bench {" ".join(wanted)} has no size: leave --size out, or name one of '
             + ', '.join(name for name, (_, own) in BENCHES.items() if own)
         )
+    before = read_report(against) if against is not None else None
     found: dict[str, list[Figure]] = {'memory': bandwidth()}
     for wish in wanted:
         run, own = BENCHES[wish]
         found[wish.value] = run(sizes or own) if own else run()
-    report = {
-        'when': time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime()),
-        'machine': _machine(),
-        'figures': {name: [asdict(row) for row in rows] for name, rows in found.items()},
-    }
-    console = Console()
+    report = Report(time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime()), _machine(), found)
+    console = Console(width=None if sys.stdout.isatty() else 160)
     if as_json:
-        console.out(json.dumps(report, indent=2), highlight=False)
+        told = asdict(report) | ({'against': asdict(before)} if before else {})
+        console.out(json.dumps(told, indent=2), highlight=False)
     else:
-        for name, rows in found.items():
-            console.print(_table(name, rows))
+        for name in found:
+            console.print(_table(name, report, before))
+        if before is not None:
+            console.print(_machines(report, before), highlight=False, soft_wrap=True)
     if save:
-        target = keep(report, '-'.join(wanted))
+        target = keep(asdict(report), '-'.join(wanted) if len(wanted) < len(Bench) else 'all')
         Console(stderr=True).print(f'saved to {target}', highlight=False)
+
+
+def read_report(path: Path) -> Report:
+    """Reads what `--save` has kept, or `--json` has printed.
+
+    Raises:
+        SessionError: there is no such file, or it is another.
+    """
+    try:
+        return TypeAdapter(Report).validate_json(path.read_bytes())
+    except OSError as error:
+        raise SessionError(f'{path}: {error.strerror}; bench --save keeps one') from None
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        place = '.'.join(str(part) for part in wrong['loc'])
+        raise SessionError(
+            f'{path} is not of a run of bench: {f"{place}: " if place else ""}{wrong["msg"]}; '
+            'bench --save keeps one'
+        ) from None
 
 
 def bandwidth() -> list[Figure]:
@@ -92,12 +131,33 @@ def _machine() -> dict[str, str]:
     return {'processor': model, 'numpy': np.__version__, **versions}
 
 
-def _table(title: str, rows: list[Figure]) -> Table:
-    table = Table(title=title, box=borders.SIMPLE_HEAD, title_justify='left')
-    for column in ('', 'median', 'tenth to ninetieth percentile', '', 'ratio', 'to'):
+def _table(name: str, report: Report, before: Report | None) -> Table:
+    table = Table(title=name, box=borders.SIMPLE_HEAD, title_justify='left')
+    then = {row.name: row for row in before.figures.get(name, [])} if before else {}
+    columns = ['', 'median', 'tenth to ninetieth percentile', '', 'ratio', 'to']
+    for column in columns + (['median then', 'ratio then'] if before else []):
         table.add_column(column, justify='left' if column in ('', 'to') else 'right')
-    for row in rows:
+    for row in report.figures[name]:
         spread = f'{row.low:.4g} to {row.high:.4g}'
-        ratio = '' if row.ratio is None else f'{row.ratio:.2f}'
-        table.add_row(row.name, f'{row.median:.4g}', spread, row.unit, ratio, row.against)
+        cells = [row.name, f'{row.median:.4g}', spread, row.unit, _ratio(row), row.against]
+        if (old := then.get(row.name)) is not None:
+            cells += [f'{old.median:.4g}', _ratio(old)]
+        table.add_row(*cells)
     return table
+
+
+def _ratio(row: Figure) -> str:
+    return '' if row.ratio is None else f'{row.ratio:.2f}'
+
+
+def _machines(report: Report, before: Report) -> str:
+    """What can be held against what was measured before."""
+    changed = [
+        f'{name} {before.machine.get(name, "unknown")}, now {value}'
+        for name, value in report.machine.items()
+        if before.machine.get(name) != value
+    ]
+    start = f'Then: {before.when}'
+    if not changed:
+        return f'{start}, on a machine of the same name; its load may have been another.'
+    return f'{start}, {"; ".join(changed)}. Compare ratios rather than medians.'
