@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cutting.method import CutMethod
+from cutting.method import CutMethod, SweepError
 from haptic_bridge.force_path import ForcePath, Tick
 from haptic_bridge.operating_state import State
 from haptic_bridge.surface import Surface
@@ -103,10 +103,14 @@ class Tissue:
             simulation.cut_failed()
             return
         positions = simulation.positions
-        if asked.command is Command.FINISH or asked.sweep is None:
-            result = self._method.finish(simulation.mesh, positions)
-        else:
-            result = self._method.advance(simulation.mesh, positions, asked.sweep)
+        try:
+            if asked.command is Command.FINISH or asked.sweep is None:
+                result = self._method.finish(simulation.mesh, positions)
+            else:
+                result = self._method.advance(simulation.mesh, positions, asked.sweep)
+        except SweepError:
+            simulation.cut_failed()
+            return
         if result.delta.empty:
             simulation.cut_done()
         else:

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from meshes import irregular_box
 
+from cutting.combined import CombinedMethod
+from cutting.method import SweepError
 from haptic_bridge.force_path import ForcePath
 from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
 from session.errors import SessionError
 from session.in_process import InProcess, LinkSettings, Tissue
+from session.measure.bench_strokes import Session
 from session.measure.haptics_pages import run_accuracy, run_stability
 from tissue_sim.blade import Resistance
 from tissue_sim.material import Material
@@ -72,6 +75,25 @@ def test_an_answer_takes_computing_and_the_way_there_and_back(delay):
         ages.append(loop.path.simulation_age(10**9 + (loop.ticks - 1) * 10**6))
     first = int(np.flatnonzero(np.isfinite(ages))[0])
     assert first == pytest.approx(FRAME + 1000 * (0.01 + delay), abs=1)
+
+
+def test_a_sweep_that_is_refused_is_asked_for_again_as_in_the_graph(monkeypatch):
+    asked = []
+    advance = CombinedMethod.advance
+
+    def refused_at_first(self, mesh, positions, sweep):
+        asked.append(sweep)
+        if len(asked) == 1:
+            raise SweepError('too long')
+        return advance(self, mesh, positions, sweep)
+
+    monkeypatch.setattr(CombinedMethod, 'advance', refused_at_first)
+    strokes = Session(600)
+    before = len(strokes.simulation.mesh.tetrahedra)
+    strokes.stroke()
+    assert len(asked) > 2
+    np.testing.assert_allclose(asked[1].tip_from, asked[0].tip_from, atol=2e-3)  # of steps of 5
+    assert len(strokes.simulation.mesh.tetrahedra) > before
 
 
 @pytest.mark.parametrize('command', [run_accuracy, run_stability])

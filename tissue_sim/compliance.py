@@ -206,7 +206,7 @@ class PointCompliance:
             b.reshape(-1, 3)[nodes] = weights[:, None] * axis
             b[at] = np.where(free[at], b[at], 0.0)
             load[:] = b[at]
-            least = float(preconditioner[at] @ np.square(load)) * _SETTLED**2
+            least = float((preconditioner[at] * np.square(load)).sum()) * _SETTLED**2
             x[at] *= free[at]
             if len(patch) == n:
                 _conjugate_gradients(operands, preconditioner, b, x, work, steps, least)
@@ -214,7 +214,7 @@ class PointCompliance:
                 _patch_gradients(operands, spans, preconditioner, b, x, work, steps, least)
             residual[:] = work[0][at]
         x = np.ascontiguousarray(self._x[:, at])
-        value = loads @ x.T + x @ residuals.T
+        value = np.einsum('ai,bi->ab', loads, x) + np.einsum('ai,bi->ab', x, residuals)
         if not np.isfinite(value).all():
             self._x = np.zeros((0, 0))  # what it has come to is no start for the next
             return LIMP * np.eye(len(axes))

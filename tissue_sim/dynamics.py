@@ -395,7 +395,7 @@ class Dynamics:
         v, inertia = self.velocity, self._inertia[: self.mesh.node_count]
         if not self._active.whole:  # the others are at rest
             v, inertia = v[self._active.nodes], inertia[self._active.nodes]
-        return 0.5 * float(inertia @ np.square(v).sum(axis=1))
+        return 0.5 * float((inertia * np.square(v).sum(axis=1)).sum())
 
     def _follow_cut(self, nodes: np.ndarray) -> None:
         """Brings what is kept by node up to date where a cut touched it, nodes of shape (r,)."""
