@@ -100,7 +100,7 @@ def bench_strokes(
     seed: Seed = 0,
     growth: Annotated[
         float, typer.Option(min=1, max=1000, help='tissue.integration.frequency_growth.')
-    ] = 1.5,
+    ] = 1.1,
     output: Annotated[
         Path, typer.Option('--output', '-o', help='Folder; charts/ in it takes the picture.')
     ] = Path('docs'),

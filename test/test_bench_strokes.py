@@ -27,7 +27,7 @@ def test_many_strokes_leave_a_sound_mesh_and_memory_in_proportion(
     assert [row.strokes for row in rows] == [0, 10, 20, 30]
     assert session.simulation.elements_cut > 3 * STROKES
     assert last.tetrahedra > 1.2 * first.tetrahedra
-    assert last.substeps <= 1.6 * first.substeps  # growth of 1.5, and rounding
+    assert last.substeps <= 1.3 * first.substeps  # growth of 1.1, and the tool on lighter nodes
     _, memory = ratios(rows)
     print(f'{last.tetrahedra} tetrahedra, {last.loose} loose, memory by element {memory:.2f}')
     assert memory <= LIMIT

@@ -39,7 +39,7 @@ from tissue_sim.simulation import TissueSimulation
 from tissue_sim.topology import OUTER
 from tissue_sim.warm_up import warm_up
 
-GROWTH = 1.5
+GROWTH = 1.1
 """How far cuts may raise the highest frequency: the step of the whole tissue follows it."""
 _STIFFNESS, _RADIUS, _BLADE = 200.0, 0.004, 0.03
 """[N/m] of the tool's spring, [m] of its tip's sphere and of its edge."""
