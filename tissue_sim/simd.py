@@ -31,7 +31,8 @@ class _VectorModel(models.PrimitiveModel):
 
 def _at(context: Any, builder: Any, array: tuple[Any, Any], index: Any, kind: Any) -> Any:
     """Pointer to what a contiguous array, given by type and value, has at an index."""
-    assert array[0].layout == 'C' and array[0].ndim == 1, array[0]
+    of = array[0]
+    assert of.layout == 'C' and of.ndim == 1 and (kind is _BYTE or of.dtype == types.float64), of
     data = context.make_array(array[0])(context, builder, array[1]).data
     return builder.bitcast(builder.gep(data, [index]), kind.as_pointer())
 

@@ -109,8 +109,8 @@ class _Load:
         ]
         if self._cut:
             count = self._simulation.elements_cut
-            name = f'  computed by cutting, {count} elements in all, {self._label}'
-            figures.append(figure(name, 'ms', answers))
+            figures.append(figure(f'  computed by cutting, {self._label}', 'ms', answers))
+            figures.append(figure(f'  elements cut, {self._label}', '-', [count]))
         return figures
 
     def _frame(self, number: int) -> tuple[float, float, int]:

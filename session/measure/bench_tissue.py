@@ -225,9 +225,9 @@ def palpation(size: int, name: ModelName, nodes: int) -> list[Figure]:
     some = f'{nodes} nodes move' if nodes else 'all nodes move'
     label = f'{name}, {len(mesh.tetrahedra)} tetrahedra, {some}'
     total = float(np.median(times[:, 0]))
-    head = figure(f'frame, {label}, {frame.substeps} substeps', 'ms', times[:, 0])
     return [
-        head,
+        figure(f'frame, {label}', 'ms', times[:, 0]),
+        figure(f'  substeps, {label}', '-', [frame.substeps]),
         *(
             figure(f'  {part}, {label}', 'ms', column, float(np.median(column)) / total, 'frame')
             for part, column in zip(parts, times.T[1:], strict=True)
