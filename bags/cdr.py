@@ -1,6 +1,6 @@
-"""Messages of a bag by the definitions in the bag itself: no ROS, and no matter what is installed.
+"""Decoder of CDR messages by the definitions in the bag itself; no ROS, no installed packages.
 
-Limitations: little-endian plain CDR, which is what every RMW of Jazzy sends on the machines that
+Limitations: little-endian plain CDR, the only kind that an RMW of Jazzy sends on the machines that
 ROS supports; no `wstring`.
 """
 
@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bags.errors import BagError
-from bags.message_text import SEPARATOR
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.message_text import SEPARATOR
 
 _LITTLE_ENDIAN = b'\x00\x01'
 _ENCAPSULATION = 4
@@ -33,12 +33,42 @@ _FIELD = re.compile(
 )
 
 
+MAX_DEFINITION = 1 << 20
+"""Characters of a type's definition, contained types included; our longest has 9,000."""
+MAX_NESTING = 32
+"""Levels of nested structures."""
+MAX_VALUES = 1 << 20
+"""Python objects of one message; an array of numbers counts as one."""
+
+
+class MissingFieldError(BagError, AttributeError):
+    """A field is read that the bag's definition of the message does not have."""
+
+
+class Decoded(SimpleNamespace):
+    """A message with the fields of its definition."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise MissingFieldError(
+            f'a message of the bag has no field {name}: its definition is another'
+        )
+
+
 class _Cursor:
-    """A place in the bytes of one message."""
+    """A read position in the bytes of one message, with a count of the objects made so far."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
         self.at = _ENCAPSULATION
+        self.values = 0
+
+    def make(self, values: int, min_size: int = 0) -> None:
+        """Count objects to be created from at least `min_size` bytes each."""
+        self.values += values
+        if values * min_size > len(self.data) - self.at:
+            raise ValueError(f'{values} values go beyond its end')
+        if self.values > MAX_VALUES:
+            raise ValueError(f'it has more than {MAX_VALUES} values')
 
     def align(self, size: int) -> int:
         self.at += (_ENCAPSULATION - self.at) % size
@@ -57,12 +87,12 @@ class _Field(NamedTuple):
 
 
 class Decoder:
-    """Turns recorded bytes into objects with the fields of their message.
+    """Decodes recorded bytes to objects with the fields of their message.
 
     Arrays of numbers become NumPy arrays that share the bytes, all other arrays lists.
 
     Args:
-        schemas: `ros2msg` text by type, as a bag has them.
+        schemas: `ros2msg` text by type, from the bag.
     """
 
     def __init__(self, schemas: Mapping[str, str]) -> None:
@@ -70,33 +100,38 @@ class Decoder:
         self._readers: dict[str, _Read] = {}
 
     def decode(self, type_name: str, data: bytes) -> Any:
-        """The message in CDR bytes, with its encapsulation header.
+        """Return the message in CDR bytes, with its encapsulation header.
 
         Raises:
-            BagError: the bag does not define the type, or the bytes are not such a message.
+            BagError: the bag does not define the type, or the bytes do not fit it.
         """
-        if type_name not in self._readers:
-            self._readers[type_name] = self._compile(type_name)
         if data[:2] != _LITTLE_ENDIAN:
             raise BagError(
-                f'a message of type {type_name} is not little-endian plain CDR: it starts with '
-                f'{data[:4].hex()}'
+                f'a message of type {type_name[:80]} is not little-endian plain CDR: it starts '
+                f'with {data[:4].hex()}'
             )
         try:
+            if type_name not in self._readers:
+                self._readers[type_name] = self._compile(type_name)
             return self._readers[type_name](_Cursor(data))
-        except (struct.error, ValueError, UnicodeDecodeError) as error:
-            raise BagError(f'a message of type {type_name} is damaged: {error}') from None
+        except BagError:
+            raise
+        except (struct.error, ValueError, OverflowError) as error:
+            raise BagError(f'a message of type {type_name[:80]} is damaged: {error}') from None
 
     def _compile(self, type_name: str) -> _Read:
         text = self._schemas.get(type_name)
         if text is None:
-            raise BagError(f'the bag does not define the type {type_name}')
+            raise BagError(f'the bag does not define the type {type_name[:80]}')
+        if len(text) > MAX_DEFINITION:
+            raise BagError(f'the definition of {type_name[:80]} has {len(text)} characters')
         package = type_name.split('/')[0]
         own, *others = text.split(f'{SEPARATOR}\nMSG: ')
         definitions = {'': _fields(own, package)}
         for other in others:
             name, _, body = other.partition('\n')
             definitions[name.strip()] = _fields(body, name.split('/')[0])
+        _check_nesting('', definitions, (), {})
         return _structure('', definitions, {})
 
 
@@ -120,18 +155,44 @@ def _full_name(name: str, package: str) -> str:
     return f'{parts[0] if len(parts) > 1 else package}/{parts[-1]}'
 
 
+def _check_nesting(
+    name: str,
+    definitions: Mapping[str, list[_Field]],
+    above: tuple[str, ...],
+    known: dict[str, int],
+) -> int:
+    """Return the depth of nested structures of a type, itself included."""
+    if name in above:
+        raise BagError(f'the definition of {name[:80] or above[-1][:80]} contains itself')
+    if name not in known:
+        above = (*above, name)
+        inner = {f.type for f in definitions.get(name, ()) if f.type in definitions}
+        depths = [MAX_NESTING]
+        if len(above) <= MAX_NESTING:
+            depths = [_check_nesting(each, definitions, above, known) for each in inner]
+        known[name] = 1 + max(depths, default=0)
+    if known[name] > MAX_NESTING:
+        raise BagError(
+            f'the definition of {name[:80]} has more than {MAX_NESTING} types within one another'
+        )
+    return known[name]
+
+
 def _structure(
     name: str, definitions: Mapping[str, list[_Field]], known: dict[str, _Read]
 ) -> _Read:
     if name not in definitions:
-        raise BagError(f'the bag uses the type {name} and does not define it')
+        raise BagError(f'the bag uses the type {name[:80]} and does not define it')
     if name not in known:
-        parts = [(f.name, _value(f, definitions, known)) for f in definitions[name]]
+        fields = definitions[name]
+        parts = [(f.name, _value(f, definitions, known)) for f in fields]
 
-        def read(cursor: _Cursor) -> SimpleNamespace:
+        def read(cursor: _Cursor) -> Decoded:
+            cursor.make(len(parts))
             if not parts:  # a structure without members has one byte on the wire
+                cursor.make(1, min_size=1)
                 cursor.at += 1
-            return SimpleNamespace(**{field: part(cursor) for field, part in parts})
+            return Decoded(**{field: part(cursor) for field, part in parts})
 
         known[name] = read
     return known[name]
@@ -140,6 +201,8 @@ def _structure(
 def _value(
     field: _Field, definitions: Mapping[str, list[_Field]], known: dict[str, _Read]
 ) -> _Read:
+    if field.length == 0:
+        raise BagError(f'the field {field.name[:80]} is an array without elements')
     if field.length is not None and field.type in _CODES:
         return _numbers(np.dtype(_SIZES[field.type]), field.length)
     if field.type in _CODES:
@@ -150,8 +213,16 @@ def _value(
         item = _structure(field.type, definitions, known)
     if field.length is None:
         return item
-    fixed = field.length
-    return lambda cursor: [item(cursor) for _ in range(_count(cursor) if fixed < 0 else fixed)]
+    return _list(item, field.length)
+
+
+def _list(item: _Read, fixed: int) -> _Read:
+    def read(cursor: _Cursor) -> list[Any]:
+        count = _count(cursor) if fixed < 0 else fixed
+        cursor.make(count, min_size=1)  # every element takes at least a byte
+        return [item(cursor) for _ in range(count)]
+
+    return read
 
 
 def _number(code: struct.Struct) -> _Read:
@@ -166,7 +237,7 @@ def _number(code: struct.Struct) -> _Read:
 def _numbers(dtype: 'np.dtype[Any]', fixed: int) -> _Read:
     def read(cursor: _Cursor) -> Any:
         count = _count(cursor) if fixed < 0 else fixed
-        if count == 0:  # nothing is aligned for nothing
+        if count == 0:  # an empty array has no alignment
             return np.empty(0, dtype)
         at = cursor.align(dtype.itemsize)
         cursor.at += count * dtype.itemsize

@@ -1,32 +1,34 @@
-"""A session computed again, compared with what was recorded, frame by frame and bit for bit.
+"""Comparison of a re-simulated session with its recording, frame by frame and bit for bit.
 
-Another processor adds in another order, and so rounds otherwise: what differs by no more than that
-is told, and the comparison goes on.
+Another processor adds in another order, and so rounds differently. A difference of that size is
+reported, and the comparison goes on.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import takewhile
 from typing import Any
 
 import numpy as np
 
-from bags.frames import FrameRecord, Restart, read_first_run, runs
-from bags.reader import Bag
-from bags.resimulation import Recomputation
-from bags.topics import MESH, UPDATES
-from haptic_bridge.wire import ForceSampleCodec, Sample
-from tissue_sim.contact import Frame
-from tissue_sim.replica import MeshReplica, state_hash
-from tissue_sim.simulation import TissueSimulation
-from tissue_sim.tool_contact import tool_contact
+from cutting_trainer.bags.beginning import ComputationStart
+from cutting_trainer.bags.frames import FrameRecord, Restart, Segment, read_run, runs
+from cutting_trainer.bags.order import Sequence
+from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.resimulation import LACKS_MEMORY, Resimulation
+from cutting_trainer.bags.topics import INPUTS, MESH, UPDATES
+from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
+from cutting_trainer.tissue_sim.contact.incoming import tool_contact
+from cutting_trainer.tissue_sim.contact.tool import Frame
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica, state_hash
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
-PoseError = Callable[[Sample, Any], float]
-"""Takes a device pose and a contact; how far [m] the tool is from where that pose puts it."""
-ROUNDING = 1e-9
-"""Largest difference, in relation to what was recorded, that counts as rounding. One that matters
-grows past it: the computation goes on from its own state, not from what was recorded."""
+PoseError = Callable[[StampedMessage, Any], float]
+"""Returns the distance [m] of the tool of a contact from the place that a device pose gives."""
+MAX_ROUNDING = 1e-9
+"""Largest relative difference that counts as rounding. A difference that matters grows beyond it:
+the computation goes on from its own state, not from the recorded one."""
 _QUANTITIES = {
     'force': 'N',
     'position': 'm',
@@ -38,7 +40,7 @@ _QUANTITIES = {
 
 
 class _Differs(Exception):  # noqa: N818
-    """What is computed is not what was recorded, in one sentence."""
+    """A computed value differs from the recorded one; the message is a sentence."""
 
     def __init__(self, what: str, size: float = np.inf) -> None:
         super().__init__(what)
@@ -46,19 +48,19 @@ class _Differs(Exception):  # noqa: N818
 
 
 class _Lacks(_Differs):
-    """A frame cannot be computed from what the bag has."""
+    """A frame cannot be computed from the data in the bag."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Where what is computed first differs from what was recorded.
+    """First difference of the computation from the recording.
 
     Attributes:
         step: frame.
         seconds: its time since the first frame [s].
-        what: one sentence.
-        size: of it, in relation to what was recorded; infinite where it is not one of numbers.
-        lacks: it was not computed, because the bag lost what it would be computed from.
+        what: the difference, one sentence.
+        size: relative to the recorded value; infinite where it is not one of numbers.
+        lacks: the frame was not computed, because the bag lost data that it needs.
     """
 
     step: int
@@ -70,18 +72,20 @@ class Difference:
 
 @dataclass
 class Comparison:
-    """What a re-simulation came to.
+    """Result of a re-simulation.
 
     Attributes:
         frames: computed.
-        seconds: of the session that they are [s].
-        forces, meshes, hashes, poses: compared.
-        missing: what the bag lacks, in number, by a phrase.
-        difference: the first of more than rounding, None where there is none.
-        restart: where another process went on, from a state that the bag does not have (velocities,
-            what the method of cutting remembered): it ends there. None: nowhere.
-        rounding: the first difference of no more than `ROUNDING`.
-        largest: such difference, in relation to what was recorded.
+        seconds: duration of these frames [s].
+        forces, meshes, hashes, poses: numbers of those compared.
+        missing: number of lacking items in the bag, by a phrase.
+        difference: the first beyond rounding, None where there is none.
+        restart: continuation by another process, from a state that the bag does not have
+            (velocities, memory of the cutting method): the comparison ends there. None: nowhere.
+        begins: the first frame that was computed.
+        doubled: messages that the bag has once more.
+        rounding: the first difference of no more than `MAX_ROUNDING`.
+        largest: largest such difference, relative to the recorded value.
     """
 
     frames: int = 0
@@ -93,42 +97,51 @@ class Comparison:
     missing: Counter[str] = field(default_factory=Counter)
     difference: Difference | None = None
     restart: Restart | None = None
+    begins: int = 1
+    doubled: int = 0
     rounding: Difference | None = None
     largest: float = 0.0
 
     @property
     def identical(self) -> bool:
-        """Whether all that was compared is the same bit for bit."""
+        """Return whether all compared values are the same bit for bit."""
         return self.difference is None and self.rounding is None
 
 
 class RecordedMesh:
-    """The tissue as recorded, frame by frame, from keyframes and deltas.
+    """Reconstructs the recorded tissue, frame by frame, from keyframes and deltas.
 
     Args:
         bag: to read.
+        beginning: of its computation.
 
     Attributes:
-        gaps: deltas that did not fit: one before them is missing.
-        hashes: of keyframes and deltas that were checked against what they lead to.
+        doubled: messages that the bag has once more.
+        gaps: deltas that did not fit: one before them is missing. None has to fit before a state,
+            and its keyframe, that was recorded in the middle of a session.
+        hashes: number of keyframes and deltas whose hash was verified.
     """
 
-    def __init__(self, bag: Bag) -> None:
+    def __init__(self, bag: Bag, beginning: ComputationStart) -> None:
+        since = beginning.segment.since
+        self._begins = beginning.step if beginning.tissue else 0
         self.replica = MeshReplica()
         self.gaps = 0
         self.hashes = 0
-        self._deltas = _Ahead(bag, UPDATES)
-        self._keyframes = _Ahead(bag, MESH)
+        deltas, keyframes = Sequence(bag, UPDATES), Sequence(bag, MESH)
+        self.doubled = deltas.doubled + keyframes.doubled
+        self._deltas = _Ahead(bag, deltas, since)
+        self._keyframes = _Ahead(bag, keyframes, since)
 
     def follow(self, step: int) -> None:
-        """Goes on to a frame.
+        """Apply the messages up to a frame.
 
         Raises:
-            _Differs: a message of the bag does not lead to its own hash.
+            _Differs: the hash of a message does not match the tissue.
         """
         for delta in self._deltas.until(step):
             if not self.replica.apply(delta):
-                self.gaps += 1
+                self.gaps += delta.step > self._begins
             else:
                 self._check(delta, 'delta')
         for mesh in self._keyframes.until(step):
@@ -138,7 +151,7 @@ class RecordedMesh:
                 self._check(mesh, 'keyframe')
 
     def known(self, step: int) -> bool:
-        """Whether the replica is what the frame published; false after a gap."""
+        """Return whether the replica equals the published tissue of a frame; false after a gap."""
         unchanged = self._deltas.next_base in (None, self.replica.revision)
         return self.replica.step == step or unchanged
 
@@ -152,16 +165,17 @@ class RecordedMesh:
 
 
 class _Ahead:
-    """Messages of one topic with a step, read one ahead, up to a restart of their publisher."""
+    """Iterates over messages of one topic with a step, one ahead, up to a publisher's restart."""
 
-    def __init__(self, bag: Bag, topic: str) -> None:
-        first = takewhile(lambda of: of[0] == 0, runs(bag, topic))
-        self._source: Iterator[Any] = (message for _, message in first)
+    def __init__(self, bag: Bag, messages: Iterable[Recorded], since: int) -> None:
+        later = (recorded for recorded in messages if recorded.log_time >= since)
+        first = takewhile(lambda of: of[0] == 0, runs(bag, later))
+        self._source: Iterator[Any] = (message for *_, message in first)
         self._next = next(self._source, None)
 
     @property
     def next_base(self) -> int | None:
-        """Revision that the next delta starts from; None after the last."""
+        """Return the revision from which the next delta starts; None after the last."""
         return None if self._next is None else int(self._next.base_revision)
 
     def until(self, step: int) -> Iterator[Any]:
@@ -172,30 +186,37 @@ class _Ahead:
 
 def compare(
     bag: Bag,
-    computed: Recomputation,
+    computed: Resimulation,
     pose_error: PoseError,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    beginning: ComputationStart | None = None,
 ) -> Comparison:
-    """Computes the frames of a bag from their recorded inputs, until one differs or a restart.
+    """Compute the frames of a bag from their recorded inputs, until one differs or a restart.
 
     Args:
         bag: to read.
         computed: of the bag's scene, before its first frame.
-        pose_error: how far the tool of a contact is from where its pose puts it.
-        progress: told how many frames are done, and how many there are.
+        beginning: the start of the computation; None: the first frame of the session.
+        pose_error: returns the distance of a contact's tool from the place of its pose.
+        progress: called with the number of computed frames and of all frames.
     """
-    recorded = RecordedMesh(bag)
-    records, restart = read_first_run(bag)
-    comparison = Comparison(restart=restart)
+    start = beginning or ComputationStart(1, Segment(0, 1, 1))
+    recorded = RecordedMesh(bag, start)
+    every, restart = read_run(bag, start.segment.run)
+    records = start.frames(every)
+    comparison = Comparison(restart=restart, begins=start.step, doubled=recorded.doubled)
+    comparison.doubled += Sequence(bag, INPUTS).doubled
     for i, record in enumerate(records):
         comparison.seconds = (record.time - records[0].time) * 1e-9
         try:
-            _check_record(record, i + 1, comparison, pose_error)
+            _check_record(record, start.step + i, comparison, pose_error)
             for rounded in _check_frame(record, computed, recorded, comparison):
                 comparison.largest = max(comparison.largest, rounded.size)
-                comparison.rounding = comparison.rounding or _told(record, comparison, rounded)
+                comparison.rounding = comparison.rounding or _as_difference(
+                    record, comparison, rounded
+                )
         except _Differs as differs:
-            comparison.difference = _told(record, comparison, differs)
+            comparison.difference = _as_difference(record, comparison, differs)
             break
         comparison.frames += 1
         progress(i + 1, len(records))
@@ -205,7 +226,7 @@ def compare(
     return comparison
 
 
-def _told(record: FrameRecord, comparison: Comparison, differs: _Differs) -> Difference:
+def _as_difference(record: FrameRecord, comparison: Comparison, differs: _Differs) -> Difference:
     lacks = isinstance(differs, _Lacks)
     return Difference(record.step, comparison.seconds, str(differs), differs.size, lacks)
 
@@ -227,11 +248,11 @@ def _check_record(
 
 
 def _check_frame(
-    record: FrameRecord, computed: Recomputation, recorded: RecordedMesh, comparison: Comparison
+    record: FrameRecord, computed: Resimulation, recorded: RecordedMesh, comparison: Comparison
 ) -> Iterator[_Differs]:
-    """Computes one frame and compares what came of it; gives differences by rounding."""
+    """Compute one frame and compare its results; yield differences by rounding."""
     if what := computed.take_answer(record.answer):
-        raise _Differs(what)
+        raise (_Lacks if what == LACKS_MEMORY else _Differs)(what)
     simulation = computed.simulation
     try:
         contact = record.contact and tool_contact(record.contact, simulation.mesh)
@@ -254,14 +275,14 @@ def _check_frame(
 
 
 def _unless_rounded(what: str, size: float) -> _Differs:
-    """A difference of numbers, if it may be one by rounding; raised if it is not."""
+    """Return a difference of numbers if it may be rounding; raise it otherwise."""
     differs = _Differs(what, size)
-    if not size <= ROUNDING:
+    if not size <= MAX_ROUNDING:
         raise differs
     return differs
 
 
-def _check_force(frame: Frame, topology: int, sample: Sample) -> Iterator[_Differs]:
+def _check_force(frame: Frame, topology: int, sample: StampedMessage) -> Iterator[_Differs]:
     get = ForceSampleCodec.fields
 
     def was(name: str) -> np.ndarray:

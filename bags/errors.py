@@ -1,5 +1,5 @@
-"""The one error of this package."""
+"""The exception of this package."""
 
 
 class BagError(ValueError):
-    """A bag cannot be written or read; the message says which, why, and what would be right."""
+    """A bag cannot be written or read; the message says which, why, and the remedy."""

@@ -1,11 +1,11 @@
-"""Definitions of message types as bags carry them, from the installed packages; no ROS import."""
+"""Definitions of message types in the format of bags, from installed packages; no ROS."""
 
 import os
 import re
 import sys
 from pathlib import Path
 
-from bags.errors import BagError
+from cutting_trainer.bags.errors import BagError
 
 SEPARATOR = '=' * 80
 _PRIMITIVES = re.compile(r'bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64)')
@@ -19,11 +19,11 @@ _EVENT = (
 
 
 def schema_text(type_name: str) -> str:
-    """The `ros2msg` text of a type: its own definition, then each type that it contains, once.
+    """Return the `ros2msg` text of a type: its own definition, then each contained type once.
 
     Args:
-        type_name: `package/msg/Type`, or `package/srv/Service_Event` for what the introspection of
-            a service publishes; that one is composed from the .srv file.
+        type_name: `package/msg/Type`, or `package/srv/Service_Event` for the introspection messages
+            of a service; those are composed from the .srv file.
 
     Raises:
         BagError: a definition is not installed.
@@ -48,7 +48,7 @@ def schema_text(type_name: str) -> str:
 def _split(type_name: str) -> tuple[str, str, str]:
     parts = type_name.split('/')
     if len(parts) != 3:
-        raise BagError(f'"{type_name}" is not a message type: expected package/msg/Type')
+        raise BagError(f'"{type_name[:80]}" is not a message type: expected package/msg/Type')
     return parts[0], parts[1], parts[2]
 
 
@@ -96,6 +96,6 @@ def _find(package: str, folder: str, file_name: str) -> Path | None:
 
 
 def _prefixes() -> list[str]:
-    """Where ament looks, and the environment of this interpreter, where wheels put their files."""
+    """Return the prefixes of ament, and the environment of this interpreter for wheels' files."""
     listed = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     return [prefix for prefix in [*listed, sys.prefix] if prefix]

@@ -1,4 +1,4 @@
-"""metadata.yaml, version 9, as rosbag2 on Jazzy reads it."""
+"""Reader and writer of metadata.yaml, version 9, as rosbag2 on Jazzy has it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,12 +7,16 @@ from typing import Any
 
 import yaml
 
-from bags.errors import BagError
-from bags.qos import Profiles, metadata_profiles
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.plain_yaml import MAX_BYTES, load_yaml
+from cutting_trainer.bags.qos import Profiles, metadata_profiles
+from cutting_trainer.node_common.code_identity import CodeIdentity, identity_of
+from cutting_trainer.node_common.yaml_bounds import YamlBoundError, read_bounded
 
-FORMAT_VERSION = 2
-"""Version of what our bags hold beyond rosbag2's own format; grows when a reader must know."""
+FORMAT_VERSION = 4
+"""Version of our additions to rosbag2's format; grows with each change that a reader must know."""
 METADATA_FILE = 'metadata.yaml'
+_SIMULATION = '/tissue_sim'
 _ROOT = 'rosbag2_bagfile_information'
 
 
@@ -35,7 +39,7 @@ class Topic:
 
 @dataclass
 class Tally:
-    """What of a bag is on disk.
+    """Messages of a bag that are on disk.
 
     Attributes:
         counts: messages by topic.
@@ -49,17 +53,17 @@ class Tally:
 
     @property
     def messages(self) -> int:
-        """Messages of all topics."""
+        """Return the number of messages of all topics."""
         return sum(self.counts.values())
 
     def add(self, topic: str, log_time: int) -> None:
-        """Counts one message."""
+        """Count one message."""
         self.start = min(self.start or log_time, log_time)
         self.end = max(self.end, log_time)
         self.counts[topic] = self.counts.get(topic, 0) + 1
 
     def merge(self, other: 'Tally') -> None:
-        """Counts all that the other has counted."""
+        """Add the counts of another tally."""
         if other.counts:
             self.start = min(self.start or other.start, other.start)
             self.end = max(self.end, other.end)
@@ -70,7 +74,7 @@ class Tally:
 def bag_information(
     file_name: str, topics: Mapping[str, Topic], tally: Tally, custom_data: Mapping[str, str]
 ) -> dict[str, Any]:
-    """What metadata.yaml says of a bag of one file, without the outermost key."""
+    """Return the content of metadata.yaml for a bag of one file, without the outermost key."""
     duration = {'nanoseconds': tally.end - tally.start}
     start = {'nanoseconds_since_epoch': tally.start}
     return {
@@ -109,13 +113,13 @@ def bag_information(
 
 
 def to_yaml(information: Mapping[str, Any]) -> str:
-    """The YAML text of `bag_information`."""
+    """Return the YAML text of `bag_information`."""
     text: str = yaml.safe_dump(dict(information), sort_keys=False, allow_unicode=True)
     return text
 
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
-    """Writes metadata.yaml so that at any moment the whole old or the whole new one is there."""
+    """Write metadata.yaml atomically: the old or the new one is complete at any moment."""
     temporary = folder / f'{METADATA_FILE}.tmp'
     try:
         temporary.write_text(to_yaml({_ROOT: dict(information)}), encoding='utf-8')
@@ -126,29 +130,64 @@ def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
-    """What `bag_information` made, from the metadata.yaml of a folder.
+    """Return the content of a folder's metadata.yaml, as `bag_information` has it.
 
     Raises:
         BagError: there is none, or it is not that of a bag.
     """
     path = folder / METADATA_FILE
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+        content = load_yaml(read_bounded(path, MAX_BYTES), str(path))
     except FileNotFoundError:
         raise BagError(_no_bag(folder)) from None
     except NotADirectoryError:
         raise BagError(f'{folder} is a file: name the folder of the bag, {folder.parent}') from None
-    except (yaml.YAMLError, ValueError) as error:
-        raise BagError(f'{path} is not the metadata of a bag: {error}') from None
+    except YamlBoundError as error:
+        raise BagError(error.of(path)) from None
+    except UnicodeDecodeError as error:
+        raise BagError(
+            f'{path} is not the metadata of a bag: byte {error.start} is no text'
+        ) from None
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
     if not (isinstance(content, dict) and isinstance(content.get(_ROOT), dict)):
         raise BagError(f'{path} is not the metadata of a bag: it has no {_ROOT}')
     return dict(content[_ROOT])
 
 
 def _no_bag(folder: Path) -> str:
-    """Why a folder is no bag, and what may have been meant."""
+    """Return why a folder is no bag, and which folder may have been meant."""
     if not folder.exists():
         return f'{folder} is not a bag: there is no such folder'
     bags = sorted(path.parent.name for path in folder.glob(f'*/{METADATA_FILE}'))
     inside = f', but bags in it: {", ".join(bags[-5:])}' if bags else ''
     return f'{folder} is not a bag: it has no {METADATA_FILE}{inside}'
+
+
+def recorded_parameters(
+    data: Mapping[str, str], where: str = 'parameters in the metadata'
+) -> dict[str, Any]:
+    """Return the recorded parameters of a session's nodes: values by name by node.
+
+    Args:
+        data: `custom_data` of the bag.
+        where: field that contains them, for the error.
+
+    Raises:
+        BagError: they are not the YAML of a bag.
+    """
+    nodes = load_yaml(data.get('parameters', ''), where)
+    return nodes if isinstance(nodes, dict) else {}
+
+
+def recorded_code(data: Mapping[str, str]) -> CodeIdentity | None:
+    """Return the identity of the code that computed a session; None: the bag does not name it.
+
+    It is that of `tissue_sim`, which may have run on another host than the recorder. Where the bag
+    lacks that node's statement, it is the recorder's.
+
+    Args:
+        data: `custom_data` of the bag.
+    """
+    node = recorded_parameters(data).get(_SIMULATION)
+    return identity_of(node if isinstance(node, dict) else {}) or identity_of(data)

@@ -1,8 +1,7 @@
-"""Node `recorder`: every topic of the graph, as it comes, into a bag."""
+"""Node `recorder`: records every topic of the graph into a bag."""
 
 import itertools
 import json
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -10,25 +9,29 @@ from importlib.metadata import PackageNotFoundError, version
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from bags.errors import BagError
-from bags.message_class import message_class
-from bags.message_text import schema_text
-from bags.metadata import FORMAT_VERSION
-from bags.parameters import ParameterCollector
-from bags.qos import OfferedQos
-from bags.sequences import SequenceCounter
-from bags.writer import BagWriter
-from tissue_sim.lifecycle import ManagedNode, Stop, announce_ready, run
-from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
-from tissue_sim.refusals import MessageError
-from tissue_sim.ros import (
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.message_class import message_class
+from cutting_trainer.bags.message_text import schema_text
+from cutting_trainer.bags.metadata import FORMAT_VERSION
+from cutting_trainer.bags.parameters import ParameterCollector
+from cutting_trainer.bags.qos import OfferedQos
+from cutting_trainer.bags.sequences import SequenceCounter
+from cutting_trainer.bags.steady_clock import SteadyClock
+from cutting_trainer.bags.topics import FORCES
+from cutting_trainer.bags.writer import BagWriter
+from cutting_trainer.node_common.code_identity import identity_here
+from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
+from cutting_trainer.node_common.output import announce
+from cutting_trainer.node_common.parameters import parameter, scene_parameter, seed_parameter
+from cutting_trainer.node_common.rejections import MessageError
+from cutting_trainer.node_common.ros import (
     ARM,
     CONTACT,
+    CUTTING_STATE,
     DIAGNOSTICS,
     EVENTS,
     FORCE,
@@ -38,20 +41,22 @@ from tissue_sim.ros import (
     MESH,
     MESH_UPDATES,
     STREAM,
+    TISSUE_STATE,
     UPDATES,
     Diagnostics,
     polled,
 )
-from tissue_sim.share import share_folder
-from tissue_sim.timing import request_preference
+from cutting_trainer.node_common.timing import request_preference
 
-_POLL = 0.004
+_POLL_PERIOD_S = 0.004
 _NICENESS = -5
-_DISCOVER = 0.02
-_REVIEW = 1.0
-_FLUSH = 0.2
-_QUEUE = 1000
-"""Messages that a topic may have waiting: a second of a 1 kHz stream."""
+_DISCOVERY_PERIOD_S = 0.02
+_REVIEW_PERIOD_S = 1.0
+_FLUSH_PERIOD_S = 0.2
+_INPUTS_TIMEOUT_S = 5.0
+"""Time after which the recorder subscribes to states, with or without the inputs of frames."""
+_QUEUE_DEPTH = 1000
+"""Messages in the queue of a topic: a second of a 1 kHz stream."""
 
 _CONFIGURED = {
     MESH: LATCHED,
@@ -63,21 +68,21 @@ _CONFIGURED = {
     f'{ARM}/measured_cp': STREAM,
     f'{ARM}/measured_cv': STREAM,
     f'{ARM}/measured_cf': STREAM,
-    f'{ARM}/servo_cf': STREAM,
+    **{name[1:]: STREAM for name in FORCES},
     f'{ARM}/operating_state': LATCHED,
 }
-"""Depths of our publishers: the graph tells every other part of a QoS, but not its history."""
+"""Depths of our publishers: the graph shows every other part of a QoS, but not its history."""
 
 
 @dataclass(frozen=True)
 class Account:
-    """What became of the messages of one topic.
+    """Numbers of messages of one topic, by their fate.
 
     Attributes:
-        received: that came.
-        written: that are on disk.
-        lost: on the way, by their sequence numbers, or refused by the disk.
-        unheard: sent before the recorder knew the topic.
+        received: by the recorder.
+        written: to the disk.
+        lost: in transport, by their sequence numbers, or not taken by the disk.
+        unheard: missed before subscription.
     """
 
     received: int
@@ -87,15 +92,15 @@ class Account:
 
     @property
     def sentence(self) -> str:
-        """For the user."""
+        """Return the numbers as a phrase for the user."""
         parts = [f'{self.received} received', f'{self.written} written', f'{self.lost} lost']
         if self.unheard:
-            parts.append(f'{self.unheard} sent before it was heard')
+            parts.append(f'{self.unheard} missed before subscription')
         return ', '.join(parts)
 
 
 class _Stream:
-    """One recorded topic: its subscription, taken from by polling, and what came of it."""
+    """One recorded topic: its polled subscription, and the counts of its messages."""
 
     def __init__(self, topic: str, subscription: Any, count_publishers: Callable[[], int]) -> None:
         self.topic = topic
@@ -106,17 +111,17 @@ class _Stream:
 
 
 class Recorder(ManagedNode):
-    """Subscribes to whatever the graph has and writes it to the bag named by the parameter `bag`.
+    """Subscribes to every topic of the graph and writes it to the bag of the parameter `bag`.
 
-    It judges no message but by its size: malformed ones are recorded as they came, byte for byte,
-    since a bag is where one looks for them. Its refusals count what is larger than `max_message`.
+    It checks only the size of a message: malformed ones are recorded byte for byte, for later
+    analysis. Its rejection statistics count messages larger than `max_message`.
 
     Parameters:
         bag: folder of the new bag.
-        scene: scene file, of which the text goes into the bag; none when empty.
+        scene: scene file, whose text goes into the bag; none when empty.
         seed: of the session; goes into the bag.
-        account_as_json: say at the end in lines for the launcher what became of all messages.
-        max_message: bytes of a message that is recorded, of meshes too.
+        account_as_json: report the counts of all messages at the end, as JSON for the launcher.
+        max_message: largest number of bytes of a recorded message, meshes included.
     """
 
     largest_message = 1 << 26
@@ -124,19 +129,25 @@ class Recorder(ManagedNode):
     def __init__(self) -> None:
         super().__init__('recorder')
         self._configured = False
+        self._polls = 0
 
     def configure(self) -> None:
-        """Begins the bag."""
+        """Create the bag."""
         folder = str(parameter(self, 'bag', '', 'new folder for the bag'))
         if not folder:
             raise BagError('the parameter "bag" is missing: name the folder of the new bag')
         scene, seed = scene_parameter(self), seed_parameter(self)
-        text = 'say at the end in lines of JSON what became of all messages'
+        text = 'report the counts of all messages at the end in lines of JSON'
         self._as_json = bool(parameter(self, 'account_as_json', False, text))
         self.writer = BagWriter(self._folder(Path(folder)), custom_data=_custom_data(scene, seed))
+        self._steady = SteadyClock()
         self._streams: dict[str, _Stream] = {}
         self._unrecorded: dict[str, str] = {}
+        self._needless: dict[str, str] = {}
         self._drawings = self.resolve_topic_name(MARKERS)
+        self._states = {self.resolve_topic_name(name) for name in (TISSUE_STATE, CUTTING_STATE)}
+        self._inputs = [self.resolve_topic_name(name) for name in (CONTACT, FRAME_INPUTS)]
+        self._begun = time.monotonic()
         self._collector = ParameterCollector(self)
         self._depths = {
             self.resolve_topic_name(name): profile.depth for name, profile in _CONFIGURED.items()
@@ -144,7 +155,7 @@ class Recorder(ManagedNode):
         self._diagnostics = Diagnostics(self, self._collect)
 
     def _folder(self, asked: Path) -> Path:
-        """The folder that was asked for; or, where it is taken, one named after it."""
+        """Return the requested folder; or, where it exists, a new one named after it."""
         again, self._configured = self._configured, True
         text = 'the bag was begun by a recorder that died: begin one beside it'
         if not (parameter(self, 'resume', False, text) or again):
@@ -152,16 +163,27 @@ class Recorder(ManagedNode):
         later = (asked.with_name(f'{asked.name}-{count}') for count in itertools.count(2))
         return next(folder for folder in itertools.chain([asked], later) if not folder.exists())
 
+    @property
+    def progress(self) -> int:
+        """Return the number of loop iterations."""
+        return self._polls
+
     def work(self, stop: Stop) -> None:
-        """Records until `stop` is set."""
+        """Record until `stop` is set."""
         self.get_logger().info(request_preference(_NICENESS))
         self._forget()
+        self._begun = time.monotonic()
         self.discover()
         announce_ready(self)
-        periods = {self.discover: _DISCOVER, self.review: _REVIEW, self.flush: _FLUSH}
+        periods = {
+            self.discover: _DISCOVERY_PERIOD_S,
+            self.review: _REVIEW_PERIOD_S,
+            self.flush: _FLUSH_PERIOD_S,
+        }
         due = dict.fromkeys(periods, 0.0)
         while not stop.is_set():
-            time.sleep(_POLL)
+            self._polls += 1
+            time.sleep(_POLL_PERIOD_S)
             self.drain()
             now = time.monotonic()
             for act, period in periods.items():
@@ -170,28 +192,43 @@ class Recorder(ManagedNode):
                     act()
 
     def rest(self) -> None:
-        """Records what has come, and lets pass what comes from now on."""
+        """Record the received messages, and ignore later ones."""
         self.drain()
         self.flush()
 
     def _forget(self) -> None:
-        """Lets go of what came while the node was inactive: it is neither recorded nor lost."""
+        """Drop the messages that came while the node was inactive: neither recorded nor lost."""
         for stream in self._streams.values():
             while stream.take(stream.message_type, True) is not None:
                 pass
             stream.counter.pause()
 
     def discover(self) -> None:
-        """Subscribes to topics that have got their first publisher since the last time."""
+        """Subscribe to topics that have got their first publisher since the last call.
+
+        A subscription to states asks for one. It comes last: the frames after a state can only be
+        computed again from their inputs.
+        """
+        early = not self._hears_inputs()
         for topic, types in self.get_topic_names_and_types():
-            if topic not in self._streams and topic not in self._unrecorded:
+            if early and topic in self._states:
+                continue
+            known = (self._streams, self._unrecorded, self._needless)
+            if not any(topic in topics for topics in known):
                 if topic == self._drawings:
-                    self._unrecorded[topic] = 'it is drawn from what is recorded'
+                    self._needless[topic] = 'it is drawn from recorded topics'
                     continue
                 self._start(topic, types[0])
 
+    def _hears_inputs(self) -> bool:
+        """Return whether the inputs of frames arrive, or have had the time to."""
+        if time.monotonic() - self._begun > _INPUTS_TIMEOUT_S:
+            return True
+        streams = [self._streams.get(topic) for topic in self._inputs]
+        return all(stream is not None and stream.counter.received > 0 for stream in streams)
+
     def review(self) -> None:
-        """Looks at the nodes, and at the publishers of recorded topics, anew."""
+        """Check the nodes, and the publishers of recorded topics, anew."""
         self._collector.look()
         self.writer.describe(parameters=self._collector.text)
         for stream in self._streams.values():
@@ -204,54 +241,57 @@ class Recorder(ManagedNode):
                 )
 
     def flush(self) -> None:
-        """Hands what has come to the operating system; says at once when that refuses it."""
+        """Hand the received messages to the operating system; log an error of the disk at once."""
         well = not self.writer.failure
         self.writer.flush()
         if well and self.writer.failure:
             self.get_logger().error(f'{self.writer.failure}: nothing is recorded from now on')
 
     def drain(self) -> None:
-        """Takes all that has come and gives it to the writer in the order of arrival."""
+        """Take all received messages and write them in the order of arrival."""
         batch = []
+        if step := self._steady.look():
+            text = f'the clock of this computer was set by {step * 1e-9:+.3g} s'
+            self.get_logger().warning(f'{text}: times in the bag are corrected for it')
         for stream in list(self._streams.values()):
             while (taken := stream.take(stream.message_type, True)) is not None:
                 data, info = taken
                 if len(data) > self.max_message:
                     text = f'{len(data)} bytes: {self.max_message} at most (parameter max_message)'
-                    self.refusals.add(stream.topic, MessageError('too large', text))
+                    self.rejections.add(stream.topic, MessageError('too large', text))
                     stream.counter.add(info['publication_sequence_number'])
                     continue
                 number = info['publication_sequence_number']
                 stream.counter.add(number)
-                received = info['received_timestamp'] or time.time_ns()
+                received = self._steady.of(info['received_timestamp'] or time.time_ns())
                 batch.append((received, stream.topic, info['source_timestamp'], data, number))
         batch.sort(key=itemgetter(0))
         for received, topic, published, data, number in batch:
             self.writer.write(topic, received, published, data, number or 0)
 
     def release(self) -> None:
-        """Takes the last messages, completes the bag and says what became of all."""
+        """Take the last messages, complete the bag and report the counts."""
         self.writer.describe(parameters=self._collector.text)
         self.writer.close()
-        self._say(self.accounts())
+        self._report_accounts(self.accounts())
         if self.writer.failure:
             lost = sum(self.writer.lost.values())
             text = f'{self.writer.failure}: {lost} messages are not in the bag'
-            print(f'failed: {self.get_name()}: {text}', flush=True)
+            announce(f'failed: {self.get_name()}: {text}')
 
-    def _say(self, accounts: dict[str, Account]) -> None:
-        """What became of all messages, for the user or for the launcher."""
+    def _report_accounts(self, accounts: dict[str, Account]) -> None:
+        """Log the counts of all messages, for the user or for the launcher."""
         tally = self.writer.tally
         if self._as_json:
-            told = {
+            report = {
                 'bag': str(self.writer.folder),
                 'bytes': self.writer.size,
                 'failure': self.writer.failure,
-                'not_recorded': self._unrecorded,
+                'not_recorded': self._unrecorded | self._needless,
             }
-            print(f'message: {json.dumps(told)}', flush=True)
-            for topic, account in accounts.items():  # one by one: lines have a greatest length
-                print(f'message: {json.dumps({topic: asdict(account)})}', flush=True)
+            announce(f'message: {json.dumps(report)}')
+            for topic, account in accounts.items():  # one by one: the length of a line is limited
+                announce(f'message: {json.dumps({topic: asdict(account)})}')
             return
         print(
             f'recorded: {tally.messages} messages, {len(tally.counts)} topics, '
@@ -260,11 +300,11 @@ class Recorder(ManagedNode):
         )
         for topic, account in accounts.items():
             print(f'  {topic}: {account.sentence}', flush=True)
-        for topic, reason in self._unrecorded.items():
+        for topic, reason in (self._unrecorded | self._needless).items():
             print(f'  not recorded: {topic}: {reason}', flush=True)
 
     def accounts(self) -> dict[str, Account]:
-        """What became of the messages of each topic so far."""
+        """Return the counts of the messages of each topic so far."""
         written, refused = self.writer.tally.counts, self.writer.lost
         return {
             topic: Account(
@@ -273,7 +313,7 @@ class Recorder(ManagedNode):
                 lost=stream.counter.lost + refused.get(topic, 0),
                 unheard=stream.counter.before,
             )
-            for topic, stream in self._streams.copy().items()  # the loop may find another one
+            for topic, stream in self._streams.copy().items()  # the loop may add one meanwhile
         }
 
     def _start(self, topic: str, type_name: str) -> None:
@@ -287,7 +327,7 @@ class Recorder(ManagedNode):
             return
         depth = self._depths.get(topic, 10)
         profiles = dict.fromkeys(_offered(info.qos_profile, depth) for info in publishers)
-        # rosbags looks up hashes of messages only, and refuses a bag that has any other.
+        # rosbags looks up hashes of messages only, and rejects a bag that has any other.
         type_hash = str(publishers[0].topic_type_hash) if '/msg/' in type_name else ''
         self.writer.add_topic(topic, type_name, schema, type_hash, tuple(profiles))
         subscription = polled(self, message_type, topic, _request(publishers))
@@ -308,7 +348,7 @@ class Recorder(ManagedNode):
         values: dict[str, object] = {**totals, 'bytes': self.writer.size}
         for topic, account in accounts.items():
             values |= {f'{word} {topic}': count for word, count in asdict(account).items()}
-        unrecorded = self._unrecorded.copy().items()
+        unrecorded = (self._unrecorded | self._needless).items()
         values |= {f'not recorded {topic}': reason for topic, reason in unrecorded}
         if self.writer.failure:
             return DiagnosticStatus.ERROR, self.writer.failure, values
@@ -318,21 +358,14 @@ class Recorder(ManagedNode):
 
 
 def main() -> None:
-    """Runs the node; exit status 1 where the disk has refused messages."""
+    """Run the node; exit status 1 where the disk did not take all messages."""
     recorder = run(Recorder)
     raise SystemExit(1 if recorder.writer.failure else 0)
 
 
 def _custom_data(scene: str, seed: int) -> dict[str, str]:
-    data = {
-        'format_version': str(FORMAT_VERSION),
-        'seed': str(seed),
-        'python_version': platform.python_version(),
-    }
-    manifest = share_folder() / 'package.xml'
-    if manifest.is_file():
-        data['trainer_version'] = ElementTree.parse(manifest).findtext('version', '')
-    for package in ('ros-jazzy-rclpy', 'rclpy', 'numpy', 'numba', 'mcap'):
+    data = {'format_version': str(FORMAT_VERSION), 'seed': str(seed), **identity_here().flat()}
+    for package in ('ros-jazzy-rclpy', 'rclpy', 'mcap'):
         try:
             data[f'{package}_version'] = version(package)
         except PackageNotFoundError:
@@ -359,13 +392,13 @@ def _offered(profile: QoSProfile, depth: int) -> OfferedQos:
 
 
 def _request(publishers: list[Any]) -> QoSProfile:
-    """The strongest QoS that all of the publishers offer."""
+    """Return the strongest QoS that all of the publishers offer."""
     profiles = [info.qos_profile for info in publishers]
     reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
     latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=_QUEUE,
+        depth=_QUEUE_DEPTH,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

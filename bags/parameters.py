@@ -1,4 +1,4 @@
-"""The parameters of all nodes of the graph, asked for once and kept for the bag."""
+"""Collector of the parameters of all nodes of the graph, for the bag."""
 
 from typing import Any
 
@@ -9,12 +9,12 @@ from rclpy.parameter import parameter_value_to_python
 
 
 class ParameterCollector:
-    """Asks each node for its parameters when it is first seen; nothing waits for the answers.
+    """Requests the parameters of each node when it first appears; nothing waits for the answers.
 
-    Later changes are not asked for: they are on /parameter_events, and so in the bag.
+    Later changes are not requested: they are on /parameter_events, and so in the bag.
 
     Args:
-        node: to ask with.
+        node: its services are used for the requests.
     """
 
     def __init__(self, node: Node) -> None:
@@ -24,12 +24,12 @@ class ParameterCollector:
 
     @property
     def text(self) -> str:
-        """What is known, as YAML: values by name by node; '' while there is nothing."""
+        """Return the known parameters as YAML: values by name by node; '' while there are none."""
         known = dict(sorted(self._values.items()))
         return str(yaml.safe_dump(known, sort_keys=True)) if known else ''
 
     def look(self) -> None:
-        """Asks nodes that have come since the last time."""
+        """Request the parameters of nodes that are new since the last call."""
         for name, namespace in self._node.get_node_names_and_namespaces():
             full = f'{namespace.rstrip("/")}/{name}'
             if full in self._values:
@@ -41,7 +41,7 @@ class ParameterCollector:
                     self._node.create_client(ListParameters, f'{full}/list_parameters'),
                     self._node.create_client(GetParameters, f'{full}/get_parameters'),
                 ]
-                continue  # the services are seen some time after the node
+                continue  # the services appear some time after the node
             listing, getting = self._waiting[full]
             if listing.service_is_ready() and getting.service_is_ready():
                 self._ask(full, listing, getting)

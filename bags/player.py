@@ -1,4 +1,4 @@
-"""What is to be published when a bag is played; no ROS and no clock of its own."""
+"""Messages to publish for a replay at each position; no ROS and no clock of its own."""
 
 import queue
 import threading
@@ -7,27 +7,27 @@ from contextlib import suppress
 
 import numpy as np
 
-from bags.errors import BagError
-from bags.reader import Bag, Recorded
-from bags.topics import BUTTON, MESH, POSE, UPDATES, of_session
-from haptic_bridge.wire import PoseStampedCodec, Sample
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.topics import BUTTON, MESH, POSE, UPDATES, of_session
+from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, StampedMessage
 
-STEP = 1 / 30
-"""[s] of the session that one step shows: a frame of the simulation."""
+STEP_S = 1 / 30
+"""[s] of the session per step: a frame of the simulation."""
 
 
 class Playhead:
-    """Where in the session a replay is.
+    """Position of a replay in the session.
 
     Args:
         start: [s] from the beginning of the session.
-        end: [s]; with `loop` it goes on from `start` there.
+        end: [s]; with `loop` it continues from `start` there.
         rate: seconds of the session in one second.
         loop: begin again at the end.
 
     Attributes:
         paused: it stands still.
-        rounds: how often it has begun again.
+        rounds: number of repetitions.
         rate: seconds of the session in one second; may be changed.
     """
 
@@ -41,16 +41,16 @@ class Playhead:
 
     @property
     def position(self) -> float:
-        """Where it was at the last move [s]."""
+        """Return the position at the last move [s]."""
         return self._position
 
     @property
     def over(self) -> bool:
-        """Whether the end has been reached for good."""
+        """Return whether the end has been reached for good."""
         return not self._loop and self._position >= self._end
 
     def move(self, now: float) -> float:
-        """Goes on to a time of the caller's clock [s]; returns the position [s]."""
+        """Advance to a time of the caller's clock [s]; return the position [s]."""
         if not self.paused and self._since is not None:
             self._position += (now - self._since) * self.rate
         self._since = now
@@ -60,21 +60,21 @@ class Playhead:
         return self._position
 
     def go(self) -> None:
-        """Goes on."""
+        """Resume."""
         self.paused = False
 
     def toggle(self) -> None:
-        """Pauses, or goes on."""
+        """Pause or resume."""
         self.paused = not self.paused
 
     def seek(self, position: float) -> None:
-        """Goes to a position [s]."""
+        """Go to a position [s]."""
         self._position = min(max(position, self._start), self._end)
 
     def step(self) -> None:
-        """Pauses, one frame further on."""
+        """Pause, one frame further on."""
         self.paused = True
-        self._position += STEP
+        self._position += STEP_S
 
 
 _BATCH, _BATCHES = 500, 4
@@ -82,7 +82,7 @@ _BATCH, _BATCHES = 500, 4
 
 
 class ReadAhead:
-    """Reads messages in a thread of its own before they are due; use `close` in the end.
+    """Reads messages in a thread of its own before they are due; call `close` at the end.
 
     A chunk of a bag takes some 20 ms to unpack: longer than a loop of 1 kHz can wait.
 
@@ -105,7 +105,7 @@ class ReadAhead:
             raise self._failure
 
     def close(self) -> None:
-        """Reads no more."""
+        """Read no more."""
         self._closed.set()
         self._thread.join()
 
@@ -119,7 +119,7 @@ class ReadAhead:
                     batch = []
                 if self._closed.is_set():
                     return
-        except Exception as error:  # whatever a damaged bag makes a parser say
+        except Exception as error:  # a damaged bag can raise any error of a parser
             self._failure = error
         if batch:
             self._put(batch)
@@ -133,9 +133,9 @@ class ReadAhead:
 
 
 class RecordedStream:
-    """The recorded messages in their order, for as long as a playhead goes forward; `close` it.
+    """Recorded messages in their order, for a playhead that moves forward; `close` it.
 
-    Deltas of the mesh are left out until a keyframe has come: whoever listens could not apply them.
+    Deltas of the mesh are left out until a keyframe has come: no subscriber could apply them.
 
     Args:
         bag: to read.
@@ -152,7 +152,7 @@ class RecordedStream:
         self._has_mesh = False
 
     def due(self, position: float) -> Iterator[Recorded]:
-        """What lies before a position [s] and has not been given yet."""
+        """Yield the messages before a position [s] that have not been published yet."""
         until = self._origin + round(position * 1e9)
         while self._next is not None and self._next.log_time <= until:
             message, self._next = self._next, next(self._messages, None)
@@ -161,12 +161,12 @@ class RecordedStream:
                 yield message
 
     def close(self) -> None:
-        """Reads no more."""
+        """Read no more."""
         self._ahead.close()
 
 
 class RecordedHand:
-    """The way of the device, and its button.
+    """The recorded path of the device, and its button events.
 
     Args:
         bag: to read.
@@ -186,16 +186,16 @@ class RecordedHand:
         self._event_times = np.array([(m.log_time - origin) * 1e-9 for m in events])
         self._events = [m.data for m in events]
 
-    def pose(self, position: float) -> Sample:
-        """The newest pose at a position [s], the first one before it."""
+    def pose(self, position: float) -> StampedMessage:
+        """Return the newest pose at a position [s], the first one before it."""
         at = int(np.searchsorted(self._times, position, 'right')) - 1
         return self._poses[max(at, 0)]
 
     def events(self, before: int, position: float) -> tuple[list[bytes], int]:
-        """What the button did on the way to a position.
+        """Return the button events on the path to a position.
 
         Args:
-            before: number of events that are done; after a way back only the last one counts.
+            before: number of events that are done; after a step back only the last one counts.
             position: [s].
 
         Returns:
@@ -206,17 +206,17 @@ class RecordedHand:
 
     @property
     def span(self) -> tuple[float, float]:
-        """Positions of the first and the last pose [s]."""
+        """Return the positions of the first and the last pose [s]."""
         return float(self._times[0]), float(self._times[-1])
 
 
 def first_time(bag: Bag) -> int:
-    """Log time of the first message [ns since the epoch]."""
+    """Return the log time of the first message [ns since the epoch]."""
     if not bag.span[0]:
         raise BagError(f'{bag.path} has no message')
     return bag.span[0]
 
 
 def duration(bag: Bag) -> float:
-    """From the first message to the last [s]."""
+    """Return the time from the first message to the last [s]."""
     return (bag.span[1] - first_time(bag)) * 1e-9

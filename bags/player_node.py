@@ -1,4 +1,4 @@
-"""The ROS side of a replay: publishes what `bags.player` gives, and watches for live input."""
+"""ROS side of a replay: publishes the messages of `bags.player`, and watches for live input."""
 
 import math
 import threading
@@ -6,59 +6,64 @@ import time
 from collections.abc import Callable, Collection
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
 
-from bags.message_class import message_class
-from bags.player import Playhead, RecordedHand, RecordedStream
-from bags.qos import OfferedQos
-from bags.reader import Bag
-from bags.topics import BUTTON, OF_DEVICE, OF_TISSUE, POSE, REPLAYED, SERVO_CF
-from haptic_bridge.operating_state import State, crtk_types
-from haptic_bridge.wire import PoseStampedCodec, WrenchStampedCodec
-from tissue_sim.ros import EVENTS, LATCHED, STREAM
-from tissue_sim.timing import PeriodicLoop
+from cutting_trainer.bags.message_class import message_class
+from cutting_trainer.bags.player import Playhead, RecordedHand, RecordedStream
+from cutting_trainer.bags.qos import OfferedQos
+from cutting_trainer.bags.reader import Bag
+from cutting_trainer.bags.topics import BUTTON, FORCES, OF_DEVICE, OF_TISSUE, POSE, REPLAYED
+from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
+from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
+from cutting_trainer.node_common.ros import EVENTS, LATCHED, NEWEST_BEST_EFFORT, STREAM, polled
+from cutting_trainer.node_common.timing import PeriodicLoop
 
-_RATE = 1000.0
-_DISCOVERY = 1.5
-"""[s] in which publishers that are there are seen."""
-_WATCH = 0.5
-_ENABLING = {False: 30.0, True: 5.0}
-"""[s] that the haptic bridge has to be enabled; in a FAULT, that it has to get out of it."""
+_RATE_HZ = 1000.0
+_MAX_DEPTH = 1000
+"""Messages in a send queue, whatever depth a bag states."""
+_DISCOVERY_S = 1.5
+"""[s] in which existing publishers are discovered."""
+_WATCH_PERIOD_S = 0.5
+_ENABLE_TIMEOUTS_S = {False: 30.0, True: 5.0}
+"""[s] in which the haptic bridge must be enabled; after a FAULT, in which it must recover."""
 
 
 def publisher_qos(profiles: list[OfferedQos]) -> QoSProfile:
-    """The QoS to play a topic with: one that every subscriber of its publishers could take."""
+    """Return the QoS to play a topic with.
+
+    It is compatible with every subscriber of the recorded publishers.
+    """
     reliable = all(profile.reliability == 'reliable' for profile in profiles)
     latched = all(profile.durability == 'transient_local' for profile in profiles) and profiles
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=max((profile.depth for profile in profiles), default=10),
+        depth=min(max((profile.depth for profile in profiles), default=10), _MAX_DEPTH),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
 
 
 class Player(Node):
-    """Plays in a thread of its own once `start` is called; use `stop` in the end.
+    """Plays in a thread of its own once `start` is called; call `stop` at the end.
 
     Args:
         context: of the domain to play into.
-        playhead: where the replay is; others may pause and step it.
+        playhead: position of the replay; others may pause and step it.
 
     Attributes:
-        refusal: why the replay was stopped, '' while it may go on.
-        faulted: where in the session [s] the haptic bridge came to a FAULT; None: it did not.
+        stop_reason: why the replay was stopped, '' while it may go on.
+        faulted: position [s] at which the haptic bridge entered FAULT; None: it did not.
     """
 
     def __init__(self, context: Context, playhead: Playhead) -> None:
         super().__init__('player', context=context)
         self.playhead = playhead
-        self.refusal = ''
+        self.stop_reason = ''
         self.faulted: float | None = None
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self)
@@ -70,23 +75,23 @@ class Player(Node):
         ]
         self._watched: list[str] = []
 
-    def refuse_live_input(self, topics: Collection[str]) -> None:
-        """Looks whether somebody else publishes on some topics, and sets `refusal` if so."""
-        time.sleep(_DISCOVERY)
+    def reject_live_input(self, topics: Collection[str]) -> None:
+        """Set `stop_reason` if another node publishes on one of the topics."""
+        time.sleep(_DISCOVERY_S)
         self._look(topics, 0)
 
     def start(self, before: Callable[[], object] = lambda: None) -> None:
-        """Starts to play.
+        """Start to play.
 
         Args:
-            before: is called in the thread that plays, before it does.
+            before: called in the playing thread first.
         """
         self._before = before
         for thread in self._threads:
             thread.start()
 
     def stop(self) -> None:
-        """Ends the replay."""
+        """End the replay."""
         self._stop.set()
         for thread in self._threads:
             if thread.is_alive():
@@ -96,14 +101,14 @@ class Player(Node):
         self.destroy_node()
 
     def play(self, position: float) -> None:
-        """Publishes what belongs to a position [s]."""
+        """Publish the messages up to a position [s]."""
         raise NotImplementedError
 
     def finish(self) -> None:
-        """Publishes what must not be left out at the end."""
+        """Publish the messages that must not be left out at the end."""
 
     def watch(self, now: float) -> None:
-        """Is called now and then, with the time [s] of `time.monotonic`."""
+        """Check the graph; called now and then, with the time [s] of `time.monotonic`."""
 
     def _look(self, topics: Collection[str], own: int) -> None:
         for topic in topics:
@@ -111,22 +116,22 @@ class Player(Node):
             others = [p for p in publishers if p.node_name != self.get_name()]
             if others or len(publishers) > max(own, 0):
                 names = ', '.join(sorted({p.node_name for p in others})) or 'another replay'
-                self.refusal = (
+                self.stop_reason = (
                     f'{names} publishes {topic}: a replay never mixes with live input; end the '
                     'other or replay in another domain (--domain free)'
                 )
                 return
 
     def _play(self) -> None:
-        loop = PeriodicLoop(_RATE)
+        loop = PeriodicLoop(_RATE_HZ)
         self._before()
         loop.start()
         try:
-            while not self._stop.is_set() and not self.refusal:
+            while not self._stop.is_set() and not self.stop_reason:
                 loop.wait()
                 self.play(self.playhead.move(time.monotonic()))
-        except Exception as error:  # whatever a damaged bag makes a parser say
-            self.refusal = f'the bag cannot be played further: {error}'
+        except Exception as error:  # a damaged bag can raise any error of a parser
+            self.stop_reason = f'the bag cannot be played further: {error}'
 
     def _serve(self) -> None:
         due = 0.0
@@ -134,22 +139,22 @@ class Player(Node):
             while not self._stop.is_set():
                 self._executor.spin_once(timeout_sec=0.05)
                 if (now := time.monotonic()) >= due:
-                    due = now + _WATCH
+                    due = now + _WATCH_PERIOD_S
                     self._look(self._watched, 1)
                     self.watch(now)
-        except Exception as error:  # deaf, the replay would wait for ever
+        except Exception as error:  # without the graph, the replay would wait for ever
             if not self._stop.is_set():
-                self.refusal = f'the replay cannot listen to the graph any more: {error}'
+                self.stop_reason = f'the replay cannot listen to the graph any more: {error}'
 
 
 class SessionPlayer(Player):
-    """Shows a session as it was recorded: mesh, forces, contact and device.
+    """Publishes a session as recorded: mesh, forces, contact and device.
 
     Args:
         context: of the domain to play into.
-        playhead: where the replay is.
+        playhead: position of the replay.
         bag: to play.
-        start: where each round begins [s].
+        start: beginning of each round [s].
         drive_device: play the recorded force to a live device, and leave its own topics to it.
     """
 
@@ -158,14 +163,14 @@ class SessionPlayer(Player):
     ) -> None:
         super().__init__(context, playhead)
         self._bag, self._start = bag, start
-        wanted = (*OF_TISSUE, SERVO_CF) if drive_device else (*OF_TISSUE, *OF_DEVICE, BUTTON)
+        wanted = (*OF_TISSUE, *FORCES) if drive_device else (*OF_TISSUE, *OF_DEVICE, BUTTON)
         self.topics = [topic for topic in wanted if topic in bag.topics()]
         self._wrench = WrenchStampedCodec('arm_base')
         self._stream = RecordedStream(bag, self.topics, start)
         self._rounds = 0
 
     def advertise(self) -> None:
-        """Makes the publishers."""
+        """Create the publishers."""
         self._publishers_by_topic = {
             topic: self.create_publisher(
                 message_class(self._bag.topics()[topic]),
@@ -183,24 +188,24 @@ class SessionPlayer(Player):
             self._stream = RecordedStream(self._bag, self.topics, self._start)
         for message in self._stream.due(position):
             data = message.data
-            if message.topic == SERVO_CF:
+            if message.topic in FORCES:
                 values = self._wrench.decode(data).values
                 data = self._wrench.encode(time.time_ns(), values)
             self._publishers_by_topic[message.topic].publish(data)
 
     def finish(self) -> None:
         self._stream.close()
-        if SERVO_CF in self.topics and hasattr(self, '_publishers_by_topic'):
-            zero = self._wrench.encode(time.time_ns(), (0.0,) * 6)
-            self._publishers_by_topic[SERVO_CF].publish(zero)
+        for topic, publisher in getattr(self, '_publishers_by_topic', {}).items():
+            if topic in FORCES:
+                publisher.publish(self._wrench.encode(time.time_ns(), (0.0,) * 6))
 
 
 class HandPlayer(Player):
-    """Is the device of a session: publishes its recorded poses anew, a thousand times a second.
+    """Acts as the device of a session: publishes its recorded poses anew at 1 kHz.
 
-    Its button does what it did, when it did. The hand waits at the first pose until the haptic
-    bridge is enabled; a pause holds it still. When the bridge comes to a FAULT, or never gets out
-    of one, the hand stays where it is.
+    Its button events are published at their times. The hand waits at the first pose until the
+    haptic bridge is enabled; a pause holds it still. When the bridge enters FAULT, or does not
+    leave it, the hand stays at its place.
 
     Args:
         context: of the domain to play into.
@@ -217,10 +222,15 @@ class HandPlayer(Player):
         self._events = 0
 
     def advertise(self) -> None:
-        """Makes the publishers."""
+        """Create the publishers."""
         self._poses = self.create_publisher(PoseStamped, f'{REPLAYED}{POSE}', STREAM)
         self._button = self.create_publisher(Joy, f'{REPLAYED}{BUTTON}', EVENTS)
         self._watched = [f'{REPLAYED}{POSE}', f'{REPLAYED}{BUTTON}']
+        # The bridge commands no force without a device that takes it.
+        self._forces = [
+            polled(self, WrenchStamped, f'{REPLAYED}{force}', NEWEST_BEST_EFFORT)
+            for force in FORCES
+        ]
         self.create_subscription(
             crtk_types().operating_state, '/haptic_bridge/operating_state', self._heard, LATCHED
         )
@@ -229,28 +239,31 @@ class HandPlayer(Player):
         values = self._hand.pose(position).values
         self._poses.publish(self._codec.encode(time.time_ns(), values))
         events, done = self._hand.events(self._events, position)
-        # Before the bridge is enabled an event would be lost on a bridge that does not listen yet.
+        # A bridge that is not enabled may not listen yet: an event would be lost.
         if done != self._events and (self._begun or self._button.get_subscription_count()):
             self._events = done
             for data in events:
                 self._button.publish(data)
 
     def watch(self, now: float) -> None:
-        """Gives up a bridge that is not enabled: it may have been so, too shortly to be heard."""
+        """Stop for a bridge that is not enabled; it may have been so too briefly to be seen."""
         if self._since == math.inf:
             self._since = now
-        if not self._begun and now - self._since > _ENABLING[self._state == State.FAULT]:
-            if self._state == State.FAULT:
+        if (
+            not self._begun
+            and now - self._since > _ENABLE_TIMEOUTS_S[self._state == CrtkState.FAULT]
+        ):
+            if self._state == CrtkState.FAULT:
                 self.faulted = self.playhead.position
             else:
                 said = self._state or 'nothing about its state'
-                self.refusal = f'the haptic bridge was not enabled within 30 s, it says {said}'
+                self.stop_reason = f'the haptic bridge was not enabled within 30 s, it says {said}'
 
     def _heard(self, message: Any) -> None:
         if message.state != self._state:
             self._state, self._since = message.state, time.monotonic()
-        if not self._begun and message.state in (State.ENABLED, State.PAUSED):
+        if not self._begun and message.state in (CrtkState.ENABLED, CrtkState.PAUSED):
             self._begun = True
             self.playhead.go()
-        elif self._begun and self.faulted is None and message.state == State.FAULT:
+        elif self._begun and self.faulted is None and message.state == CrtkState.FAULT:
             self.faulted = self.playhead.position

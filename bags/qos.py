@@ -1,7 +1,7 @@
-"""Offered QoS as bags carry it: one object, from which both of its written forms are made.
+"""Offered QoS of a topic, with its two written forms: channel metadata and metadata.yaml.
 
-A reader that finds the channel's profiles and those of metadata.yaml to differ in any field drops
-the channel's messages without a word, so there is no other way here to write either.
+A reader that finds the two forms to differ in any field drops the channel's messages without a
+word. Therefore both are written from one object.
 """
 
 from collections.abc import Sequence
@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import yaml
+
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.plain_yaml import load_yaml
 
 NANOSECONDS = 1_000_000_000
 INFINITE = 2**63 - 1
@@ -25,7 +28,7 @@ class OfferedQos:
         reliability: reliable or best_effort.
         durability: volatile or transient_local.
         deadline: longest time between two messages [ns].
-        lifespan: age after which a message is void [ns].
+        lifespan: age after which a message expires [ns].
         liveliness: automatic or manual_by_topic.
         liveliness_lease_duration: silence after which a publisher counts as dead [ns].
     """
@@ -46,7 +49,7 @@ Profiles = Sequence[OfferedQos]
 
 
 def metadata_profiles(profiles: Profiles) -> list[dict[str, object]]:
-    """The list `offered_qos_profiles` of a topic in metadata.yaml."""
+    """Return the list `offered_qos_profiles` of a topic in metadata.yaml."""
     return [
         {
             'history': profile.history,
@@ -64,18 +67,29 @@ def metadata_profiles(profiles: Profiles) -> list[dict[str, object]]:
 
 
 def channel_profiles(profiles: Profiles) -> str:
-    """The same list as YAML text, for `offered_qos_profiles` in the metadata of an MCAP channel."""
+    """Return the same list as YAML text, for the metadata of an MCAP channel.
+
+    Its key there is `offered_qos_profiles`.
+    """
     text: str = yaml.safe_dump(metadata_profiles(profiles), sort_keys=False)
     return text
 
 
 def profiles_from(text: str) -> list[OfferedQos]:
-    """What `channel_profiles` made a text of; depths and names as they are."""
+    """Parse the text of `channel_profiles`; depths and names are taken as they are.
+
+    Raises:
+        BagError: the text is not valid.
+    """
+    where = 'offered_qos_profiles of a channel'
     found = []
-    for profile in yaml.safe_load(text) or []:
-        values: dict[str, Any] = {name: profile[name] for name in _WORDS}
-        values |= {name: _nanoseconds(profile[name]) for name in _DURATIONS}
-        found.append(OfferedQos(**values))
+    try:
+        for profile in load_yaml(text, where) or []:
+            values: dict[str, Any] = {name: profile[name] for name in _WORDS}
+            values |= {name: _nanoseconds(profile[name]) for name in _DURATIONS}
+            found.append(OfferedQos(**values))
+    except (LookupError, TypeError) as error:
+        raise BagError(f'{where}: no list of QoS profiles: {error}') from None
     return found
 
 

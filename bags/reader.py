@@ -1,26 +1,24 @@
-"""Reading bags without ROS, those that a crash has cut off included."""
+"""Reader of bags without ROS, also of those that a crash has cut off."""
 
-import struct
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
-from io import SEEK_END, BytesIO
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from heapq import merge
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Channel, Message, Schema
 
-from bags.cdr import Decoder
-from bags.errors import BagError
-from bags.metadata import FORMAT_VERSION, read_metadata
-from bags.qos import OfferedQos, profiles_from
-
-_MAGIC = b'\x89MCAP0\r\n'
-_RECORD_HEAD = struct.Struct('<BQ')
+from cutting_trainer.bags.cdr import Decoder
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.mcap.chunks import ChunkError
+from cutting_trainer.bags.mcap.ordered import in_order
+from cutting_trainer.bags.mcap.records import MAGIC, McapFile
+from cutting_trainer.bags.mcap.salvage import Salvage
+from cutting_trainer.bags.mcap.summary import McapSummary, read_summary
+from cutting_trainer.bags.metadata import FORMAT_VERSION, METADATA_FILE, read_metadata
+from cutting_trainer.bags.plain_yaml import text_by_key
+from cutting_trainer.bags.qos import OfferedQos, profiles_from
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +28,7 @@ class Recorded:
     Attributes:
         topic: its topic.
         type: `package/msg/Type`.
-        log_time: when it was received [ns since the epoch].
+        log_time: receive time [ns since the epoch].
         publish_time: its source time stamp [ns since the epoch].
         sequence: its number in the sequence of its publisher, 0 where unknown.
         data: CDR with its encapsulation header.
@@ -50,8 +48,8 @@ class Bag:
     Attributes:
         path: the MCAP file.
         complete: whether the file has its end; without it the recorder was killed or the disk full,
-            and the complete chunks are what is read.
-        custom_data: as the recorder wrote it: scene, seed, versions.
+            and only the complete chunks are read.
+        custom_data: scene, seed, versions, as the recorder wrote them.
         schemas: definition text by type.
         span: smallest and largest log time [ns since the epoch], zeros where there is no message.
     """
@@ -64,37 +62,40 @@ class Bag:
         self.schemas: dict[str, str] = {}
         self._decoder = Decoder(self.schemas)
         self.span = (0, 0)
+        self._summary = McapSummary()
         self.complete = self._read_summary()
         if not self.complete:
-            times = [message.log_time for _, _, message in self._salvage()]
-            self.span = (min(times), max(times)) if times else (0, 0)
+            self._read_salvage()
 
     def topics(self) -> dict[str, str]:
-        """Type by topic."""
+        """Return the types by topic."""
         return dict(self._topics)
 
     def profiles(self, topic: str) -> list[OfferedQos]:
-        """QoS that the publishers of a topic offered."""
+        """Return the QoS that the publishers of a topic offered."""
         return profiles_from(self._profiles.get(topic, ''))
 
     def messages(
         self, topics: Collection[str] | None = None, *, since: int = 0
     ) -> Iterator[Recorded]:
-        """Messages in the order of their log times (within a chunk only, where the end is missing).
+        """Yield messages by log time (only within a chunk where the file's end is missing).
 
         Args:
             topics: those to read; all by default.
             since: smallest log time [ns since the epoch].
 
         Raises:
-            BagError: something in it is damaged.
+            BagError: a part of the bag is damaged.
         """
-        source = self._indexed(topics, since) if self.complete else self._salvage()
-        for schema, channel, message in source:
-            if (topics is None or channel.topic in topics) and message.log_time >= since:
+        source = self._indexed(topics, since) if self.complete else self._salvaged()
+        for channel, message in source:
+            known = self._topics.get(channel.topic)
+            if known is None or (topics is not None and channel.topic not in topics):
+                continue
+            if message.log_time >= since:
                 yield Recorded(
                     channel.topic,
-                    schema.name,
+                    known,
                     message.log_time,
                     message.publish_time,
                     message.sequence,
@@ -102,91 +103,142 @@ class Bag:
                 )
 
     def read(self, recorded: Recorded) -> Any:
-        """The message of what was recorded, by the bag's own definition of its type.
+        """Decode a recorded message, by the bag's own definition of its type.
 
         Arrays of numbers are NumPy arrays, all other arrays lists.
 
         Raises:
-            BagError: the bytes are not such a message.
+            BagError: the bytes do not fit the type.
         """
         return self._decoder.decode(recorded.type, recorded.data)
 
-    def _know(self, schema: Schema, channel: Channel) -> None:
-        self._topics[channel.topic] = schema.name
-        self._profiles[channel.topic] = channel.metadata.get('offered_qos_profiles', '')
-        self.schemas[schema.name] = schema.data.decode()
+    def _know(self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]) -> None:
+        for channel in channels.values():
+            schema = schemas.get(channel.schema_id)
+            if schema is not None:
+                self._topics[channel.topic] = schema.name
+                self._profiles[channel.topic] = channel.metadata.get('offered_qos_profiles', '')
+                self.schemas[schema.name] = schema.data.decode()
 
     def _read_summary(self) -> bool:
-        with self.path.open('rb') as file:
-            # Without its end the last bytes are anything: the library would take them for records.
-            file.seek(-min(len(_MAGIC), self.path.stat().st_size), SEEK_END)
-            closed = file.read() == _MAGIC
-            file.seek(0)
-            if not closed:
-                return False
-            try:
-                summary = make_reader(file).get_summary()
-            except (McapError, struct.error):
-                return False
-        if summary is None:
+        with McapFile(self.path) as file:
+            summary = read_summary(file)
+        if summary is None or summary.flaw or not (summary.chunks or summary.messages == 0):
             return False
-        for channel in summary.channels.values():
-            self._know(summary.schemas[channel.schema_id], channel)
+        self._summary = summary
+        self._know(summary.channels, summary.schemas)
         if summary.statistics is not None:
             counted = summary.statistics
             self.span = (counted.message_start_time, counted.message_end_time)
         return True
 
+    def _read_salvage(self) -> None:
+        with Salvage(self.path) as salvage:
+            self._know(salvage.channels, salvage.schemas)
+            first, last = math.inf, 0
+            for chunk in salvage.chunks():
+                for _, message in chunk.messages:
+                    first, last = min(first, message.log_time), max(last, message.log_time)
+        self.span = (int(first), last) if first != math.inf else (0, 0)
+
     def _indexed(
         self, topics: Collection[str] | None, since: int
-    ) -> Iterator[tuple[Schema, Channel, Message]]:
-        with self.path.open('rb') as file:
-            reader = make_reader(file, validate_crcs=True)
-            try:
-                for schema, channel, message in reader.iter_messages(topics, starting_at=since):
-                    assert schema is not None
-                    yield schema, channel, message
-            except Exception as error:  # whatever the damage makes a parser say
-                raise BagError(
-                    f'{self.path} is damaged ({error}): `trainer repair` makes it readable again, '
-                    'without what is damaged'
-                ) from None
+    ) -> Iterator[tuple[Channel, Message]]:
+        channels = self._summary.channels
+        wanted = None if topics is None else {c.id for c in channels.values() if c.topic in topics}
+        try:
+            with McapFile(self.path) as file:
+                yield from in_order(file, self._summary, wanted, since)
+        except ChunkError as error:
+            raise BagError(
+                f'{self.path} is damaged ({error}): `trainer repair` makes it readable again, '
+                'without the damaged parts'
+            ) from None
 
-    def _salvage(self) -> Iterator[tuple[Schema, Channel, Message]]:
-        for chunk in salvage(self.path):
-            for channel in chunk.channels:
-                self._know(chunk.schemas[channel.schema_id], channel)
-            for channel, message in sorted(chunk.messages, key=lambda pair: pair[1].log_time):
-                yield chunk.schemas[channel.schema_id], channel, message
+    def _salvaged(self) -> Iterator[tuple[Channel, Message]]:
+        with Salvage(self.path) as salvage:
+            for chunk in salvage.chunks():
+                yield from sorted(chunk.messages, key=lambda pair: pair[1].log_time)
+
+
+class SplitBag(Bag):
+    """A bag of several files, as `ros2 bag` splits it; read as one.
+
+    Args:
+        paths: of the files.
+        custom_data: of the bag.
+
+    Raises:
+        BagError: one name has different meanings in the files.
+    """
+
+    def __init__(self, paths: Sequence[Path], custom_data: dict[str, str]) -> None:
+        self.path = paths[0].parent
+        self.custom_data = custom_data
+        self._parts = [Bag(path, custom_data) for path in paths]
+        self._topics: dict[str, str] = {}
+        self._profiles: dict[str, str] = {}
+        self.schemas: dict[str, str] = {}
+        for part in self._parts:
+            for mine, theirs in ((self._topics, part.topics()), (self.schemas, part.schemas)):
+                for name, text in theirs.items():
+                    if mine.setdefault(name, text) != text:
+                        raise BagError(f'{part.path} has another {name} than the files before it')
+            self._profiles |= part._profiles
+        self._decoder = Decoder(self.schemas)
+        spans = [part.span for part in self._parts if part.span[0]]
+        self.span = (min(s for s, _ in spans), max(e for _, e in spans)) if spans else (0, 0)
+        self.complete = all(part.complete for part in self._parts)
+
+    def messages(
+        self, topics: Collection[str] | None = None, *, since: int = 0
+    ) -> Iterator[Recorded]:
+        """Yield messages as `Bag.messages`, of all files."""
+        parts = [part for part in self._parts if part.span[1] >= since]
+        sources = (part.messages(topics, since=since) for part in parts)
+        return merge(*sources, key=lambda recorded: recorded.log_time)
 
 
 def open_bag(folder: Path | str) -> Bag:
-    """Opens a bag for reading.
+    """Open a bag for reading.
 
     Args:
         folder: the bag's folder, the one with metadata.yaml.
 
     Raises:
-        BagError: it is not a bag of one MCAP file, or of a format to come.
+        BagError: it is not a bag of MCAP files, or of a newer format.
     """
     folder = Path(folder)
     information = read_metadata(folder)
-    path = mcap_file(folder)
-    data = dict(information.get('custom_data') or {})
-    version = str(data.get('format_version', FORMAT_VERSION))
-    if not version.isdigit() or int(version) > FORMAT_VERSION:
+    paths = mcap_files(folder)
+    data = text_by_key(information.get('custom_data'), f'custom_data of {folder / METADATA_FILE}')
+    version = data.get('format_version', str(FORMAT_VERSION))[:20]
+    if not version.isdecimal() or int(version) > FORMAT_VERSION:
         raise BagError(
             f'{folder} has format {version}: this trainer reads formats up to {FORMAT_VERSION}, '
             'a newer one is needed'
         )
-    return Bag(path, data)
+    return Bag(paths[0], data) if len(paths) == 1 else SplitBag(paths, data)
 
 
 def mcap_file(folder: Path) -> Path:
-    """The one MCAP file of a bag, by its metadata.yaml or, where there is none, by its ending.
+    """Return the one MCAP file of a bag.
 
     Raises:
         BagError: it is not a bag of one MCAP file.
+    """
+    paths = mcap_files(folder)
+    if len(paths) > 1:
+        names = [path.name for path in paths]
+        raise BagError(f'{folder} is not a bag of one MCAP file: it names {names}')
+    return paths[0]
+
+
+def mcap_files(folder: Path) -> list[Path]:
+    """Return the MCAP files of a bag, by metadata.yaml or, without one, by their suffix.
+
+    Raises:
+        BagError: it is not a bag of MCAP files.
     """
     try:
         information = read_metadata(folder)
@@ -195,77 +247,14 @@ def mcap_file(folder: Path) -> Path:
     except BagError:
         if folder.is_file() or not any(folder.glob('*.mcap')):
             raise
-        names, storage = [path.name for path in folder.glob('*.mcap')], 'mcap'
-    if storage != 'mcap' or len(names) != 1:
-        raise BagError(f'{folder} is not a bag of one MCAP file: it names {names}')
-    path = folder / Path(names[0]).name
-    if not path.is_file():
-        raise BagError(f'{folder} lacks its file {path.name}')
-    with path.open('rb') as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise BagError(f'{path} is not an MCAP file')
-    return path
-
-
-@dataclass
-class Salvaged:
-    """One complete chunk of a file.
-
-    Attributes:
-        end: where it ends in the file [bytes].
-        damaged: its checksum does not hold: what was in it is gone.
-        schemas: all known so far, by number.
-        channels: that became known in this chunk.
-        messages: with their channels, in the order of the file.
-        strangers: messages of channels that were in a damaged chunk.
-    """
-
-    end: int
-    damaged: bool = False
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: list[Channel] = field(default_factory=list)
-    messages: list[tuple[Channel, Message]] = field(default_factory=list)
-    strangers: int = 0
-
-
-def salvage(path: Path) -> Iterator[Salvaged]:
-    """Reads chunk by chunk without index or end, up to the first record that is not all there."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    for end, body in _complete_chunks(path):
-        chunk = Salvaged(end, schemas=schemas)
-        try:
-            records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
-        except Exception:  # whatever zstd, lz4 or the parser says of bytes that are not their own
-            chunk.damaged = True
-            records = []
-        for record in records:
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel) and record.id not in channels:
-                channels[record.id] = record
-                chunk.channels.append(record)
-            elif isinstance(record, Message) and record.channel_id in channels:
-                chunk.messages.append((channels[record.channel_id], record))
-            else:
-                chunk.strangers += isinstance(record, Message)
-        yield chunk
-
-
-def _complete_chunks(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Where each chunk of a file ends, and its bytes, up to a record that is not all there."""
-    size = path.stat().st_size
-    with path.open('rb') as file:
-        file.seek(len(_MAGIC))
-        while head := _record_head(file):
-            opcode, length = head
-            if file.tell() + length > size:
-                return
-            body = file.read(length)
-            if opcode == Opcode.CHUNK:
-                yield file.tell(), body
-
-
-def _record_head(file: BinaryIO) -> tuple[int, int] | None:
-    head = file.read(_RECORD_HEAD.size)
-    return _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else None
+        names, storage = sorted(path.name for path in folder.glob('*.mcap')), 'mcap'
+    if storage != 'mcap' or not names:
+        raise BagError(f'{folder} is not a bag of MCAP files: it names {names}')
+    paths = [folder / Path(name).name for name in names]
+    for path in paths:
+        if not path.is_file():
+            raise BagError(f'{folder} lacks its file {path.name}')
+        with path.open('rb') as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise BagError(f'{path} is not an MCAP file')
+    return paths

@@ -1,20 +1,35 @@
-"""A session computed again from its bag; no ROS.
+"""Re-simulation of a session from its bag; no ROS.
 
-A frame depends on the state before it, on the contact that was newest when it began, and on the
-answer to a cut that it found. `tissue/frame_inputs` names both for every frame.
+A frame depends on the state before it, on the newest contact at its start, and on the answer to a
+cut that it received. `tissue/frame_inputs` names both for every frame.
 """
+
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from bags.frames import APPLIED, EMPTY, GIVEN_UP, LOST, NO_ANSWER, REFUSED
-from cutting.method import CutMethod, CutResult, SweepError, check_sweep
-from tissue_sim.contact import Command, Frame, ToolContact
-from tissue_sim.mesh import TetMesh, Touched
-from tissue_sim.simulation import TissueSimulation
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.frames import FrameRecord
+from cutting_trainer.cutting.method import (
+    FAILURES,
+    CutMethod,
+    CutResult,
+    SweepError,
+    carry_out,
+    outcome_of,
+)
+from cutting_trainer.tissue_sim.contact.incoming import tool_contact
+from cutting_trainer.tissue_sim.contact.tool import CutOutcome, Frame, ToolContact
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, Touched
+from cutting_trainer.tissue_sim.simulation.cut_transaction import ANSWER_FRAMES, CutTransaction
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+
+LACKS_MEMORY = 'the bag lacks the state of the cutting service at its start: no cut can be made'
 
 
-class Recomputation:
-    """The simulation and, beside it, the cutting service with its own mesh, as live.
+class Resimulation:
+    """The simulation and the cutting service with its own mesh, as in a live session.
 
     Args:
         simulation: of the scene, before its first frame.
@@ -22,15 +37,23 @@ class Recomputation:
 
     Attributes:
         area: of the incision, one side, at rest [m^2].
-        touched: what the last change of connectivity wrote, None before the first.
+        touched: changes of the last cut, None before the first.
+        substeps, diverged: number of substeps of all frames, and of frames that were rolled back.
+        lacks_memory: the state of the cutting service is not known: no recorded cut can be made.
+        answer_frames: for the number of a frame that requests a cut, the number of frames until
+            `answer` applies the answer; another than the default for bags of format 2 alone.
     """
 
     def __init__(self, simulation: TissueSimulation, method: CutMethod) -> None:
         self.simulation = simulation
         self.area = 0.0
         self.touched: Touched | None = None
+        self.substeps = self.diverged = 0
+        self.lacks_memory = False
+        self.answer_frames: Callable[[int], int] = lambda step: ANSWER_FRAMES
         self._method = method
-        self._asked: tuple[Frame, np.ndarray] | None = None
+        self._cut = CutTransaction(simulation)
+        self._displacement = simulation.displacement
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -41,72 +64,114 @@ class Recomputation:
         self._mesh.set_kinds(mesh.triangles, mesh.triangle_kind)
         self._outdated = False
 
+    def remember(self, method: CutMethod, mesh: TetMesh) -> None:
+        """Set the state of the cutting service: its method in a stroke, and its mesh."""
+        self._method, self._mesh = method, mesh
+
     def take_answer(self, answer: int) -> str:
-        """Does what a frame found of a cut.
+        """Apply the recorded answer to a cut in its recorded frame, whatever the protocol.
 
         Args:
             answer: as recorded.
 
         Returns:
-            Why that cannot be, '' when all is well.
+            Why that is not possible, '' when it is.
         """
-        if answer == NO_ANSWER:
+        outcome, asked = CutOutcome(answer), self._cut.asked
+        if outcome is CutOutcome.NO_ANSWER:
             return ''
-        if self._asked is None:
-            return 'a cut was answered that is not asked for now'
-        frame, displacement = self._asked
-        self._asked = None
-        if answer in (REFUSED, LOST, GIVEN_UP):
-            self._outdated |= answer != REFUSED
-            if answer == LOST:
-                self.simulation.cut_failed()
-            else:
-                self.simulation.cut_done()
+        if asked is None:
+            return 'a cut was answered that is not requested now'
+        if outcome not in (CutOutcome.APPLIED, CutOutcome.EMPTY):
+            self._resolve(outcome, CutResult.nothing())
             return ''
+        if self.lacks_memory:
+            return LACKS_MEMORY
+        assert asked.command is not None
+        mesh, positions = self._as_cutting_has_it()
         try:
-            result = self._cut(frame, displacement)
+            result = carry_out(self._method, mesh, positions, asked.command, asked.sweep)
         except SweepError as error:
-            return f'the cut of frame {frame.step} was made, and is refused now: {error}'
-        if result.delta.empty != (answer == EMPTY):
-            done = ('something', 'nothing')[answer == EMPTY]
-            return f'the cut of frame {frame.step} changed {done}, and does not so now'
-        self._apply(result)
+            return f'the cut of frame {asked.step} was made, and is rejected now: {error}'
+        except FAILURES as error:
+            return f'the cut of frame {asked.step} was made, and fails now: {error}'
+        if result.delta.empty != (outcome is CutOutcome.EMPTY):
+            done = ('something', 'nothing')[outcome is CutOutcome.EMPTY]
+            return f'the cut of frame {asked.step} changed {done}, and does not so now'
+        self._resolve(outcome, result)
         return ''
 
     def answer(self) -> int:
-        """Cuts what was asked for, if anything was; returns what came of it, as recorded."""
-        if self._asked is None:
-            return NO_ANSWER
-        (frame, displacement), self._asked = self._asked, None
-        try:
-            result = self._cut(frame, displacement)
-        except SweepError:
-            self.simulation.cut_done()
-            return REFUSED
-        self._apply(result)
-        return EMPTY if result.delta.empty else APPLIED
+        """Make the requested cut, if it is due; return its result, as it is recorded."""
+        asked = self._cut.asked
+        if asked is None or asked.command is None or not self._cut.due:
+            return CutOutcome.NO_ANSWER
+        mesh, positions = self._as_cutting_has_it()
+        outcome, result = outcome_of(self._method, mesh, positions, asked.command, asked.sweep)
+        self._resolve(outcome, result)
+        return outcome
 
     def frame(self, contact: ToolContact | None) -> Frame:
-        """Computes a frame."""
+        """Compute a frame."""
         frame = self.simulation.frame(contact)
-        if frame.command is not None:
-            self._asked = (frame, self.simulation.displacement.copy())
+        self.substeps += frame.substeps
+        self.diverged += frame.diverged
+        if self._cut.ask(frame, self.answer_frames(frame.step)):
+            self._displacement = self.simulation.displacement.copy()
         return frame
 
-    def _cut(self, frame: Frame, displacement: np.ndarray) -> CutResult:
+    def _as_cutting_has_it(self) -> tuple[TetMesh, np.ndarray]:
+        """Return the mesh of the cutting service, and its node positions at the request [m]."""
         if self._outdated:
             self._begin_anew()
-        positions = self._mesh.rest + displacement
-        if frame.command == Command.FINISH:
-            return self._method.finish(self._mesh, positions)
-        assert frame.sweep is not None
-        check_sweep(frame.sweep)
-        return self._method.advance(self._mesh, positions, frame.sweep)
+        return self._mesh, self._mesh.rest + self._displacement
 
-    def _apply(self, result: CutResult) -> None:
+    def _resolve(self, outcome: CutOutcome, result: CutResult) -> None:
         self.area += result.report.area
-        if result.delta.empty:
-            self.simulation.cut_done()
-        else:
+        self._outdated |= outcome in (CutOutcome.LOST, CutOutcome.GIVEN_UP)
+        if outcome is CutOutcome.APPLIED:
             self._mesh.apply(result.delta)
-            self.touched = self.simulation.apply_cut(result.delta)
+        touched = self._cut.resolve(outcome, result.delta)
+        self.touched = touched or self.touched
+
+
+def as_recorded(records: Sequence[FrameRecord], computed: Resimulation) -> Iterator[Frame]:
+    """Compute frames from their recorded inputs.
+
+    Args:
+        records: of the frames, from the first.
+        computed: before its first frame.
+
+    Raises:
+        BagError: a frame cannot be computed.
+    """
+    for record in records:
+        if record.step != (step := computed.simulation.step + 1):
+            raise BagError(f'the bag lacks frame {step}: nothing after it can be computed')
+        if what := computed.take_answer(record.answer):
+            raise BagError(f'frame {record.step} cannot be computed again: {what}')
+        if record.has_contact and record.contact is None:
+            raise BagError(f'the bag lacks the contact of frame {record.step}')
+        mesh = computed.simulation.mesh
+        yield computed.frame(record.contact and tool_contact(record.contact, mesh))
+
+
+def answer_frames(records: Sequence[FrameRecord]) -> Callable[[int], int]:
+    """Return the delay of a cut's answer in frames, by the protocol of the session.
+
+    Before format 3 answers were applied on arrival: the delay is then the recorded one of the last
+    cut requested before.
+
+    Args:
+        records: of its frames.
+
+    Returns:
+        A function of the number of the requesting frame.
+    """
+    fixed = max((record.answer_frames for record in records), default=ANSWER_FRAMES)
+    answered = [record for record in records if record.cut_step]
+    if fixed or not answered:
+        return lambda step: fixed or ANSWER_FRAMES
+    asked = [record.cut_step for record in answered]
+    frames = [record.step - record.cut_step for record in answered]
+    return lambda step: frames[max(bisect_right(asked, step) - 1, 0)]

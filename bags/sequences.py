@@ -1,28 +1,28 @@
-"""Losses on one topic, from the sequence numbers that its publishers give their messages."""
+"""Counter of lost messages on one topic, from the publishers' sequence numbers."""
 
 from collections.abc import Callable
 
 
 class SequenceCounter:
-    """Counts the messages of one topic that were published and never came.
+    """Counts the messages of one topic that were published and not received.
 
-    Messages do not say which publisher they are from, only their number in its sequence. The
-    publishers' sequences are told apart by continuity; when a number continues none of them, it is
-    a gap in the sequence closest below it, or the first one heard of a new publisher.
+    Messages carry only their number in a publisher's sequence, not the publisher. The sequences are
+    distinguished by continuity; a number that continues none of them is a gap in the sequence
+    closest below it, or the first message of a new publisher.
 
-    Limitations: what a publisher sent after the last message that came is not seen. With several
-    publishers, a gap in one sequence that another happens to fill is seen only when that other one
-    goes on; the count of losses is never too high.
+    Limitations: messages after the last received one of a publisher are not counted. With several
+    publishers, a gap in one sequence that another one happens to fill is found only when that other
+    one goes on; the count of losses is never too high.
 
     Args:
-        count_publishers: how many the topic has now; asked when a number continues no sequence.
+        count_publishers: returns the present number; called when a number continues no sequence.
 
     Attributes:
-        publishers: how many the topic is known to have had at once.
-        received: messages that came.
-        lost: messages missing between two that came.
-        before: messages that publishers had sent before the first that came of theirs, or while
-            nobody listened.
+        publishers: largest known number of simultaneous publishers.
+        received: number of received messages.
+        lost: number of messages missing between two received ones.
+        before: messages that publishers had sent before the first received one of theirs, or while
+            the subscription was paused.
     """
 
     def __init__(self, count_publishers: Callable[[], int] = lambda: 1) -> None:
@@ -35,11 +35,11 @@ class SequenceCounter:
         self._excused: set[int] = set()
 
     def pause(self) -> None:
-        """What is sent from now on to the next message that comes was not to be heard."""
+        """Exclude the messages up to the next received one from the count of losses."""
         self._excused = set(self._next)
 
     def add(self, number: int | None) -> None:
-        """Takes a message by its number.
+        """Count a message by its number.
 
         Args:
             number: 1 for the first of its publisher; None where the middleware has no numbers.

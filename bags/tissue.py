@@ -1,21 +1,21 @@
 """The recorded tissue at a moment of the session."""
 
-from bags.errors import BagError
-from bags.player import first_time
-from bags.reader import Bag
-from bags.topics import MESH, UPDATES
-from tissue_sim.replica import MeshReplica
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.player import first_time
+from cutting_trainer.bags.reader import Bag
+from cutting_trainer.bags.topics import MESH, UPDATES
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
 
 def tissue_at(bag: Bag, seconds: float | None = None) -> MeshReplica:
-    """The tissue as keyframes and deltas lead to it.
+    """Return the tissue that keyframes and deltas give.
 
     Args:
         bag: to read.
         seconds: moment [s] since the first message; None: the end.
 
     Raises:
-        BagError: no keyframe had come until then.
+        BagError: there is no keyframe until then.
     """
     replica = MeshReplica()
     origin = first_time(bag)
@@ -29,8 +29,14 @@ def tissue_at(bag: Bag, seconds: float | None = None) -> MeshReplica:
     return replica
 
 
+def first_tissue(bag: Bag) -> float:
+    """Return the time of the first keyframe [s since the first message]; 0 where there is none."""
+    first = next(iter(bag.messages([MESH])), None)
+    return 0.0 if first is None else (first.log_time - first_time(bag)) * 1e-9
+
+
 def follow(replica: MeshReplica, topic: str, message: object) -> None:
-    """Takes a keyframe or a delta; after a gap nothing fits until the next keyframe."""
+    """Apply a keyframe or a delta; after a gap no delta fits until the next keyframe."""
     if topic == UPDATES:
         replica.apply(message)
     elif getattr(message, 'revision', -1) > replica.revision:

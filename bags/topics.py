@@ -1,4 +1,4 @@
-"""Names of the topics of a session, as bags have them."""
+"""Names of the recorded topics of a session."""
 
 from collections.abc import Collection
 
@@ -6,21 +6,25 @@ MESH, UPDATES = '/tissue/mesh', '/tissue/mesh_updates'
 FORCE, INPUTS = '/tissue/force', '/tissue/frame_inputs'
 CONTACT = '/tool/contact'
 POSE, SERVO_CF = '/arm/measured_cp', '/arm/servo_cf'
+FORCES = (SERVO_CF, '/arm/body/servo_cf', '/arm/spatial/servo_cf')
+"""Possible topics of the force on the hand: `device.force_topic` selects one."""
 OF_DEVICE = (POSE, '/arm/measured_cv', '/arm/measured_cf')
 BUTTON = '/arm/button'
 OF_TISSUE = (MESH, UPDATES, FORCE, CONTACT)
+STATE, MEMORY = '/tissue/state', '/cutting/state'
 CUTS = '/cutting/cut/_service_event'
 DIAGNOSTICS = '/diagnostics'
 REPLAYED = '/replay'
-"""Namespace of what a replay and its nodes say to each other in a device's stead."""
+"""Namespace of the topics that replace the device's in a replay."""
 
 
 def of_session(topic: str, topics: Collection[str]) -> str:
-    """A topic of the device, or what stands in its stead in the bag of a replay.
+    """Return a topic of the device, or its replacement in the bag of a replay.
 
     Args:
         topic: name in a live session.
         topics: those of the bag.
     """
-    replayed = f'{REPLAYED}{topic}'
-    return replayed if topic not in topics and replayed in topics else topic
+    names = FORCES if topic == SERVO_CF else (topic,)
+    stand_ins = (*names, *(f'{REPLAYED}{name}' for name in names))
+    return next((name for name in stand_ins if name in topics), topic)

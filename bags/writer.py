@@ -1,37 +1,38 @@
-"""Bags as `ros2 bag` on Jazzy writes them: one MCAP file and metadata.yaml in a folder."""
+"""Writer of bags in the format of `ros2 bag` on Jazzy: one MCAP file and metadata.yaml."""
 
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 
+from mcap.records import Attachment
 from mcap.writer import Writer
 
-from bags.errors import BagError
-from bags.metadata import Tally, Topic, bag_information, to_yaml, write_metadata
-from bags.qos import Profiles, channel_profiles
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.metadata import Tally, Topic, bag_information, to_yaml, write_metadata
+from cutting_trainer.bags.qos import Profiles, channel_profiles
 
 
 class BagWriter:
     """Writes serialised messages to a new bag.
 
-    Messages are gathered in a chunk that `flush` sends to the operating system: a process that is
-    killed loses what came after its last flush. When the disk refuses a chunk, the file is cut back
-    to the chunks that are complete, and whatever comes from then on is counted as lost: no method
-    but the constructor and `add_topic` raises.
+    Messages are gathered in a chunk that `flush` hands to the operating system: a process that is
+    killed loses the messages after its last flush. When the disk is full, the file is cut back to
+    the chunks that are complete, and all later messages are counted as lost: only the constructor
+    and `add_topic` raise.
 
     Args:
-        folder: the bag; must not exist, its parents are made.
-        custom_data: goes into metadata.yaml as it is.
+        folder: the bag; must not exist, its parents are created.
+        custom_data: for metadata.yaml, unchanged.
 
     Attributes:
         folder: the bag.
         topics: by name.
-        tally: what is on disk.
-        lost: messages by topic that the disk refused.
-        failure: the disk's refusal, empty while all is well.
+        tally: counts of the messages on disk.
+        lost: number of messages by topic that the disk did not take.
+        failure: the disk's error, empty while there is none.
 
     Raises:
-        BagError: the folder exists or cannot be made.
+        BagError: the folder exists or cannot be created.
     """
 
     def __init__(self, folder: Path, *, custom_data: Mapping[str, str] | None = None) -> None:
@@ -51,7 +52,7 @@ class BagWriter:
         except FileExistsError:
             raise BagError(f'{folder} exists already: name a new folder for the bag') from None
         except OSError as error:
-            raise BagError(f'cannot make the bag {folder}: {error.strerror}') from None
+            raise BagError(f'cannot create the bag {folder}: {error.strerror}') from None
         self._writer = Writer(self._file, enable_data_crcs=True)
         self._writer.start(profile='ros2')
         self._commit()
@@ -59,18 +60,18 @@ class BagWriter:
 
     @property
     def size(self) -> int:
-        """Bytes of the MCAP file that are on disk."""
+        """Return the bytes of the MCAP file that are on disk."""
         return self._file.committed
 
     def add_topic(
         self, name: str, type_name: str, schema: str, type_hash: str, profiles: Profiles
     ) -> None:
-        """Makes a topic known; to be done once, before its first message.
+        """Add a topic; to be done once, before its first message.
 
         Args:
             name: topic, with its leading slash.
             type_name: `package/msg/Type`.
-            schema: `ros2msg` text of the type and of all that it contains.
+            schema: `ros2msg` text of the type and of all contained types.
             type_hash: `RIHS01_...` of the type.
             profiles: QoS of its publishers.
         """
@@ -89,7 +90,7 @@ class BagWriter:
         )
 
     def describe(self, **custom_data: str) -> None:
-        """Puts more into metadata.yaml, at once; nothing happens where it is known already."""
+        """Add entries to metadata.yaml, at once; nothing happens where they are known already."""
         if not self._closed and not custom_data.items() <= self._custom_data.items():
             self._custom_data |= custom_data
             self._write_metadata()
@@ -97,11 +98,11 @@ class BagWriter:
     def write(
         self, topic: str, log_time: int, publish_time: int, data: bytes, sequence: int = 0
     ) -> None:
-        """Adds a message to the chunk in progress.
+        """Add a message to the chunk in progress.
 
         Args:
             topic: a name given to `add_topic`.
-            log_time: when it was received [ns since the epoch].
+            log_time: receive time [ns since the epoch].
             publish_time: its source time stamp [ns since the epoch].
             data: CDR with its encapsulation header.
             sequence: its number in the sequence of its publisher.
@@ -114,14 +115,25 @@ class BagWriter:
             self._channels[topic], log_time, data, publish_time, sequence & 0xFFFFFFFF
         )
 
+    def attach(self, attachment: Attachment) -> None:
+        """Add an attachment of another bag."""
+        if not (self.failure or self._closed):
+            self._writer.add_attachment(
+                attachment.create_time,
+                attachment.log_time,
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
+            )
+
     def flush(self) -> None:
-        """Completes the chunk in progress and hands it to the operating system."""
+        """Complete the chunk in progress and hand it to the operating system."""
         if not (self.failure or self._closed):
             self._writer.flush()
             self._commit()
 
     def close(self) -> None:
-        """Writes what is pending, the summary and the final metadata.yaml; may be called again."""
+        """Write pending messages, the summary and the final metadata.yaml; may be called again."""
         if self._closed:
             return
         self.flush()
@@ -157,7 +169,7 @@ class BagWriter:
 
 
 class _StagedFile(BytesIO):
-    """What the MCAP library writes to: staged until `commit`, which is all or nothing."""
+    """Output file of the MCAP library: staged until `commit`, which is all or nothing."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -169,10 +181,10 @@ class _StagedFile(BytesIO):
         return self.committed + super().tell()
 
     def commit(self) -> None:
-        """Writes what is staged; on failure the file is cut back to where it was.
+        """Write the staged bytes; on failure the file is cut back.
 
         Raises:
-            OSError: the operating system took less than all of it.
+            OSError: the operating system did not take all of them.
         """
         staged = memoryview(self.getvalue())
         self.seek(0)

@@ -1,57 +1,74 @@
-"""One atomic batch: crossings that the blade has left become a change of connectivity
-(docs/cutting.md).
-"""
+"""Build a batch: crossings that the blade has left become a change of connectivity."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from cutting.cases import NAMES
-from cutting.fragments import small_pieces
-from cutting.lookup import BLOCKED, DONE, EDGES, PENDING, Tables, edge_key, find_edge, with_room
-from cutting.method import CASES, Report
-from cutting.sliding import slides
-from cutting.snapping import Limits
-from cutting.stars import Patch, cut_area, lay_patch, nodes_concerned, split_stars
-from cutting.state_table import (
+from cutting_trainer.cutting.cases import NAMES
+from cutting_trainer.cutting.fragments import small_pieces
+from cutting_trainer.cutting.lookup import (
+    BLOCKED,
+    DONE,
+    EDGES,
+    PENDING,
+    Tables,
+    edge_key,
+    find_edge,
+    with_room,
+)
+from cutting_trainer.cutting.method import CASES, CutReport
+from cutting_trainer.cutting.node_splitting import (
+    Patch,
+    cut_area,
+    lay_patch,
+    nodes_concerned,
+    split_nodes,
+)
+from cutting_trainer.cutting.sliding import slides
+from cutting_trainer.cutting.snapping import SnapLimits
+from cutting_trainer.cutting.state_table import (
     adopt,
     block,
     non_active_crossings,
     outer_bits_of,
     parents_concerned,
+    put_on_cut,
     ring_members,
     settle,
     settle_nodes,
 )
-from cutting.subdivision import Pieces, spoiled, subdivide
-from tissue_sim.mesh import TetMesh, TopologyDelta
+from cutting_trainer.cutting.subdivision import Pieces, spoiled, subdivide
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 
 _CASE_OF_STATE = np.array([CASES.index(name) for name in NAMES])
 _PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
 class CutStateError(ValueError):
-    """A state that no table knows; nothing has been changed in the mesh."""
+    """A state that is in no table; the mesh is unchanged."""
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """What tells the methods of the family apart.
+    """Parameters of a method of the family.
 
     Attributes:
-        tau: a crossing nearer to a node than this share of its edge goes to the node.
+        tau: a crossing nearer to a node than this share of its edge is snapped to the node.
         off: how far from the swept surface a node on the cut may stay that cannot slide onto it,
             and
-        shape: how far a sliding node may leave the surface of the tissue, as shares of the median
-            altitude at the start.
-        thin: no node is left off the cut for the sake of the surface where that would make an
-            element flatter than this share.
+        shape: largest distance of a sliding node from the surface of the tissue, as a share of the
+            median altitude at the start.
+        thin: a node stays on the cut where leaving it off would make an element flatter than this
+            share.
         floor: smallest altitude of a new element, as a share of the median altitude at the start.
-        true_points: new nodes at the true crossings, else at midpoints and centroids.
-        slides: snapped nodes move onto the swept surface.
-        subdivides: whether elements are divided at all.
-        least_share: new nodes keep away from the ends of an edge by this share.
+        true_points: new nodes lie at the true crossings; else at midpoints and centroids.
+        slides: snapped nodes slide onto the swept surface.
+        subdivides: elements are divided.
+        least_share: smallest distance of new nodes from the ends of an edge, as a share of the
+            edge.
+        reach: how much further than the tip the blade is taken to cut, as a share of the median
+            altitude at the start: by so much the front ends short of it in the mean.
     """
 
     tau: float = 0.33
@@ -63,22 +80,23 @@ class Scheme:
     slides: bool = True
     subdivides: bool = True
     least_share: float = 0.1
+    reach: float = 0.0
 
 
 class Batch(NamedTuple):
-    """A change of connectivity, not yet applied, with the tables, nodes and tetrahedra that
-    there are once it is.
+    """A change of connectivity to be applied, with the resulting tables and numbers of nodes and
+    tetrahedra.
     """
 
     tables: Tables
     delta: TopologyDelta
-    report: Report
+    report: CutReport
     size: tuple[int, int]
 
 
 class _Moves(NamedTuple):
-    """Snapped nodes that slide: rows in the look-up table, shape (j,), and rest positions [m],
-    (j, 3).
+    """Sliding nodes: rows in the look-up table, shape (j,), and rest positions [m], shape (j,
+    3).
     """
 
     rows: np.ndarray
@@ -91,26 +109,26 @@ def build_batch(
     tables: Tables,
     active: np.ndarray,
     scheme: Scheme,
-    limits: Limits,
+    limits: SnapLimits,
 ) -> Batch:
-    """Makes the batch of all crossings that the blade has left.
+    """Build the batch of all crossings that the blade has left.
 
     Args:
         mesh: the tissue.
         positions: current nodes [m], shape (n, 3).
-        tables: of the stroke; they follow as if the batch were applied.
-        active: nodes of the tetrahedra that the blade is in, shape (a, 4).
+        tables: of the stroke; updated as if the batch were applied.
+        active: nodes of the tetrahedra around the blade, shape (a, 4).
         scheme: of the method.
         limits: of the mesh.
 
     Raises:
-        CutStateError: an element is in a state that no table knows, or would be turned over.
+        CutStateError: an element has a state that is in no table, or would be inverted.
     """
     links = mesh.links
     edges, nodes = non_active_crossings(active, tables)
     if not len(edges) and not len(nodes):
         size = (mesh.node_count, len(mesh.tetrahedra))
-        return Batch(tables, TopologyDelta(), Report(), size)
+        return Batch(tables, TopologyDelta(), CutReport(), size)
     _place(tables, edges, scheme)
     members = ring_members(links, tables, edges)
     m = len(mesh.tetrahedra)
@@ -119,14 +137,14 @@ def build_batch(
     )
     adopt(links, tables, members)
     parents = parents_concerned(links, tables, edges, nodes)
-    pieces, moves, worst = _sound_pieces(
+    pieces, moves, worst, nodes = _sound_pieces(
         mesh, positions, tables, parents, edges, nodes, scheme, limits
     )
     return _assemble(mesh, positions, tables, edges, nodes, parents, pieces, moves, worst)
 
 
 def _place(tables: Tables, edges: np.ndarray, scheme: Scheme) -> None:
-    """Puts the new nodes of edges at their crossings, or at midpoints."""
+    """Place the new nodes of edges at their crossings, or at midpoints."""
     share = tables.edge_share[edges]
     least = scheme.least_share
     tables.edge_share[edges] = np.clip(share, least, 1 - least) if scheme.true_points else 0.5
@@ -140,10 +158,10 @@ def _sound_pieces(
     edges: np.ndarray,
     nodes: np.ndarray,
     scheme: Scheme,
-    limits: Limits,
-) -> tuple[Pieces, _Moves, float]:
-    """Divides the parents; where that falls below the floor, at midpoints, and if need be not at
-    all.
+    limits: SnapLimits,
+) -> tuple[Pieces, _Moves, float, np.ndarray]:
+    """Divide the parents; below the altitude floor at midpoints, then at nodes, and otherwise not
+    at all. Return also the nodes on the cut.
     """
     front = scheme.tau if scheme.true_points else 0.5
     plain = np.zeros(0, np.int64)
@@ -164,15 +182,18 @@ def _sound_pieces(
             stay = np.isin(tables.node_id[sliding], tables.parent_nodes[bad])
             rows = np.ascontiguousarray(sliding[~stay])
             moves = _Moves(*slides(rows, mesh.links, tables, mesh.rest, mesh.fixed, limits))
-        elif sum(block(tables, int(parent), edges) for parent in bad) == 0:
-            break
+        else:
+            more = [put_on_cut(tables, int(parent), edges, positions) for parent in bad]
+            nodes = np.concatenate([nodes, *more])
+            if not sum(map(len, more)) and not sum(block(tables, int(p), edges) for p in bad):
+                break
     if len(pieces.corners) and worst <= 0.0:
-        raise CutStateError('an element would be turned over; abort the stroke')
-    return pieces, moves, float(worst)
+        raise CutStateError('an element would be inverted; abort the stroke')
+    return pieces, moves, float(worst), nodes
 
 
 def _soften(tables: Tables, bad: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Midpoints and centroids in some parents."""
+    """Use midpoints and centroids in some parents."""
     keys = []
     for base in tables.parent_nodes[bad].tolist():
         for i, j in _PAIRS:
@@ -195,12 +216,12 @@ def _assemble(
     moves: _Moves,
     worst: float,
 ) -> Batch:
-    """Duplicates nodes, writes the delta down, and lets the tables follow it."""
+    """Duplicate nodes, write the delta, and update the tables."""
     n, m = mesh.node_count, len(mesh.tetrahedra)
     concerned = nodes_concerned(pieces, mesh.links, tables, positions, nodes, n)
     patch = lay_patch(pieces, concerned, mesh.links, tables, positions, n)
     before = patch.corners.copy()
-    copies = split_stars(patch, concerned, mesh.rest, pieces.new_rest)
+    copies = split_nodes(patch, concerned, mesh.rest, pieces.new_rest)
     area, separated = cut_area(
         patch, pieces, tables, before, mesh.rest, pieces.new_rest, moves.rows, moves.where
     )
@@ -224,21 +245,27 @@ def _assemble(
     settle_nodes(tables, n, np.sort(pieces.orphans)[::-1].copy(), copied)
     tables.node_plane[moves.rows, 3] = 0.0
     cases = _count_cases(tables, parents, pieces.states, separated)
-    report = Report(
+    report = CutReport(
         cases=cases,
         area=float(area),
         worst_altitude=worst if len(pieces.corners) else 0.0,
-        warnings=_warnings(tables, edges, small_pieces(patch, pieces, mesh.links)),
+        warnings=_warnings(mesh, tables, edges, small_pieces(patch, pieces, mesh.links)),
     )
     size = (n + len(copied) - len(pieces.orphans), m + len(owners) - len(removed))
     return Batch(tables, delta, report, size)
 
 
-def _warnings(tables: Tables, edges: np.ndarray, sizes: np.ndarray) -> tuple[str, ...]:
+def _warnings(
+    mesh: TetMesh, tables: Tables, edges: np.ndarray, sizes: np.ndarray
+) -> tuple[str, ...]:
     free = [f'a piece of {size} tetrahedra has come free' for size in sizes.tolist()]
-    blocked = int((tables.edge_state[edges] == BLOCKED).sum())
-    if blocked:
-        free.append(f'{blocked} edges were too small to divide: tissue holds together there')
+    blocked = edges[tables.edge_state[edges] == BLOCKED]
+    if len(blocked):
+        x, y, z = 1e3 * mesh.rest[tables.edge_nodes[blocked[0]]].mean(axis=0)
+        free.append(
+            f'{len(blocked)} edges were too small to divide: the tissue stays connected there, '
+            f'at ({x:.1f}, {y:.1f}, {z:.1f}) mm at rest'
+        )
     return tuple(free)
 
 
@@ -289,6 +316,6 @@ def _count_cases(
 
 
 def give_up_edges(tables: Tables) -> None:
-    """Lets no pending crossing divide an edge: only nodes are cut."""
+    """Block all pending crossings of edges: only nodes are cut."""
     states = tables.edge_state[: tables.counts[EDGES]]
     states[states == PENDING] = BLOCKED

@@ -1,20 +1,18 @@
-"""The topological cases A to H of a cut tetrahedron, expanded to arrays (thesis 5.3;
-docs/cutting.md).
+"""Topological cases A to H of a cut tetrahedron, expanded to arrays (thesis 5.3; docs/cutting.md).
 
-A child's corner is a label: 0 to 3 a node of the parent, 4 + 2 e + s a copy of the point on edge e
-that stays with
-the edge's first (s = 0) or second (s = 1) node, 16 + k the point in the face opposite node k, 20
-the point inside.
+A child's corner is a label: 0 to 3 a node of the parent; 4 + 2 e + s the copy of the point on edge
+e that stays with the edge's first (s = 0) or second (s = 1) node; 16 + k the point in the face
+opposite node k; 20 the inner point.
 """
 
 from itertools import permutations
 
 import numpy as np
 
-from cutting.geometry import EDGE_NODES
-from tissue_sim.topology import FACE_NODES
+from cutting_trainer.cutting.geometry import EDGE_NODES
+from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
-MOST_CHILDREN = 16
+MAX_CHILDREN = 16
 MID, FRONT, INSIDE = 4, 16, 20
 UNKNOWN = -1
 
@@ -64,10 +62,10 @@ TABLES: dict[str, tuple[tuple[tuple[int, int], ...], tuple[int, ...], str]] = {
     'G': ((), (0, 1), '0 1 2 23+; 0 1 23- 3'),
     'H': ((), (0,), '0 1 12+ c0; 0 2 c0 12-; 0 1 c0 3; 0 2 3 c0'),
 }
-"""A to H of the thesis; E by the diagonals of its two faces with two cut edges. Positively
+"""Cases A to H of the thesis; E by the diagonals of its two faces with two cut edges. Positively
 oriented."""
 COMPLETE = 'ABFG'
-"""Cases that cut their element in two; nothing can be added to them."""
+"""Cases that cut their element in two; no crossing can be added to them."""
 
 _EDGES = [tuple(int(i) for i in edge) for edge in EDGE_NODES]
 _ORDERS = list(permutations(range(4)))
@@ -78,7 +76,7 @@ def _edge(a: int, b: int) -> int:
 
 
 def _parse(word: str) -> tuple[int, ...]:
-    """Label as nodes: (a,), (a, b, node it stays with), or (-1, opposite node)."""
+    """Return a label as nodes: (a,), (a, b, node it stays with), or (-1, opposite node)."""
     if word[0] == 'c':
         return (-1, int(word[1]))
     if len(word) == 1:
@@ -88,7 +86,7 @@ def _parse(word: str) -> tuple[int, ...]:
 
 
 def _code(label: tuple[int, ...], to: tuple[int, ...]) -> int:
-    """Label code after the renaming of canonical node i to `to[i]`."""
+    """Return the label code after renaming canonical node i to `to[i]`."""
     if len(label) == 1:
         return to[label[0]]
     if len(label) == 2:
@@ -109,7 +107,7 @@ def _renamed(table: list[list[tuple[int, ...]]], to: tuple[int, ...]) -> list[li
 
 
 def _star(edges: list[int]) -> list[list[int]]:
-    """Cone from a point inside over faces that each have one cut edge, slit to their middle."""
+    """Return a cone from an inner point over faces with one cut edge each, slit to their centre."""
     children = []
     for k in range(4):
         face = [int(i) for i in FACE_NODES[k]]
@@ -126,7 +124,7 @@ def _star(edges: list[int]) -> list[list[int]]:
 
 
 class _Expansion:
-    """Fills the arrays below."""
+    """Builds the arrays below."""
 
     def __init__(self) -> None:
         self.state = np.full((64, 16), UNKNOWN, np.int16)
@@ -157,7 +155,7 @@ class _Expansion:
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         shape = (len(self.names), 24)
-        children = np.full((*shape, MOST_CHILDREN, 4), -1, np.int8)
+        children = np.full((*shape, MAX_CHILDREN, 4), -1, np.int8)
         number = np.zeros(shape, np.int8)
         for s, by_order in enumerate(self.children):
             for k, tets in by_order.items():
@@ -170,15 +168,15 @@ _expansion = _Expansion()
 _expansion.run()
 
 STATE = _expansion.state
-"""State by bits of the cut edges and bits of the nodes on the cut, UNKNOWN where there is none,
-shape (64, 16)."""
+"""State by bits of the cut edges and bits of the nodes on the cut, UNKNOWN without one, shape (64,
+16)."""
 NAMES = tuple(_expansion.names)
 """Case of each state: A to H or star."""
 CHILDREN, NUMBER = _expansion.arrays()
-"""Labels of the children by state and order of the node ids, shape (s, 24, 16, 4), and how many,
-shape (s, 24)."""
+"""Labels of the children by state and order of the node ids, shape (s, 24, 16, 4), and their
+number, shape (s, 24)."""
 ORDER = np.full((4, 4, 4, 4), -1, np.int8)
-"""Which order the ranks of the four node ids make."""
+"""Order of the four node ids, by their ranks."""
 for _k, _rank in enumerate(_ORDERS):
     ORDER[_rank] = _k
 IS_COMPLETE = np.array([name in COMPLETE for name in NAMES])
@@ -186,7 +184,7 @@ IS_COMPLETE = np.array([name in COMPLETE for name in NAMES])
 
 
 def _label_faces() -> np.ndarray:
-    """Bit k of a label: it lies in the parent's face opposite node k, shape (21,)."""
+    """Return the faces of each label, shape (21,); bit k: it lies in the face opposite node k."""
     bits = np.zeros(INSIDE + 1, np.uint8)
     for node in range(4):
         bits[node] = 15 & ~(1 << node)

@@ -1,14 +1,14 @@
-"""What a cut must keep (docs/cutting.md), as checks for tests and for `trainer fuzz-cuts`."""
+"""Invariants of a cut (docs/cutting.md), as checks for tests and `trainer fuzz-cuts`."""
 
 import numpy as np
 
-from tissue_sim.mesh import TetMesh
-from tissue_sim.mesh_checks import components
-from tissue_sim.topology import CUT, FACE_NODES
+from cutting_trainer.tissue_sim.mesh.checks import components
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.topology import CUT, FACE_NODES
 
 
 class ViolationError(AssertionError):
-    """A cut has broken an invariant."""
+    """A violated invariant of a cut."""
 
 
 def _claim(holds: bool, message: str) -> None:
@@ -16,45 +16,44 @@ def _claim(holds: bool, message: str) -> None:
         raise ViolationError(message)
 
 
-def lips(mesh: TetMesh) -> np.ndarray:
-    """Rest positions of the corners of the triangles that cuts have opened [m], shape (k, 3, 3)."""
+def cut_faces(mesh: TetMesh) -> np.ndarray:
+    """Return the rest positions of the corners of all cut faces [m], shape (k, 3, 3)."""
     return mesh.rest[mesh.triangles[mesh.triangle_kind == CUT]]
 
 
-def lip_area(mesh: TetMesh) -> float:
-    """Area of the triangles that cuts have opened at rest, one side [m^2]."""
-    corners = lips(mesh)
+def cut_face_area(mesh: TetMesh) -> float:
+    """Return the area of the cut faces at rest, one side [m^2]."""
+    corners = cut_faces(mesh)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return float(np.linalg.norm(normals, axis=1).sum() / 4)
 
 
 def check_area(mesh: TetMesh, area: float) -> None:
-    """Checks that the lips have the area [m^2] that the reports add up to, to 1e-9.
+    """Check the area of the cut faces [m^2] against the sum of the reports, to 1e-9.
 
     Raises:
-        ViolationError: saying by how much they differ.
+        ViolationError: the difference.
     """
-    have = lip_area(mesh)
+    have = cut_face_area(mesh)
     _claim(
         abs(have - area) <= 1e-9 * max(have, area),
-        f'the lips have an area of {have:.9g} m^2, reported were {area:.9g} m^2',
+        f'the cut faces have an area of {have:.9g} m^2, reported were {area:.9g} m^2',
     )
 
 
 def check_mesh(
-    mesh: TetMesh, volume: float, old_lips: np.ndarray | None = None, *, tolerance: float = 1e-12
+    mesh: TetMesh, volume: float, old_faces: np.ndarray | None = None, *, tolerance: float = 1e-12
 ) -> None:
-    """Checks that a mesh is conforming, positive, without pinches and orphans, and has the given
-    volume.
+    """Check that a mesh is conforming, positive, free of pinches and orphans, and of given volume.
 
     Args:
         mesh: after a batch.
-        volume: total rest volume that it has to have [m^3].
-        old_lips: `lips` when the stroke began; these may be divided on one side only.
+        volume: total rest volume [m^3].
+        old_faces: `cut_faces` at the start of the stroke; these may be divided on one side only.
         tolerance: relative.
 
     Raises:
-        ViolationError: saying what is broken, and where.
+        ViolationError: the violated invariant and its place.
     """
     tets = mesh.tetrahedra.astype(np.int64)
     volumes = mesh.volumes()
@@ -76,7 +75,7 @@ def check_mesh(
     _claim(bool((across == mesh.neighbors).all()), 'the adjacency differs from a rebuild')
     _check_surface(mesh, tets)
     _check_pinches(tets, across, mesh.node_count)
-    _check_hanging(mesh, np.zeros((0, 3, 3)) if old_lips is None else old_lips)
+    _check_hanging(mesh, np.zeros((0, 3, 3)) if old_faces is None else old_faces)
 
 
 def _pairs(face: np.ndarray, count: int) -> np.ndarray:
@@ -99,8 +98,8 @@ def _check_surface(mesh: TetMesh, tets: np.ndarray) -> None:
 
 
 def corner_groups(tets: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Group of each corner; corners at a node are one where faces with the node connect them,
-    shape (4 m,).
+    """Return the group of each corner, shape (4 m,): corners at a node connected by faces with the
+    node.
     """
     tet, face = np.nonzero(across >= 0)
     other = across[tet, face] // 4
@@ -118,32 +117,30 @@ def _check_pinches(tets: np.ndarray, across: np.ndarray, nodes: int) -> None:
     groups = corner_groups(tets, across)
     pairs = np.unique(np.stack([tets.ravel(), groups]), axis=1)
     stars = np.bincount(pairs[0], minlength=nodes)
-    _claim(stars.max() == 1, f'node {int(stars.argmax())} holds parts together that share no face')
+    _claim(stars.max() == 1, f'node {int(stars.argmax())} connects parts that share no face')
 
 
-def _check_hanging(mesh: TetMesh, old_lips: np.ndarray) -> None:
-    """Every new free face of the cut has its counterpart on the other lip: no node hangs."""
-    corners = lips(mesh)
+def _check_hanging(mesh: TetMesh, old_faces: np.ndarray) -> None:
+    """Check that every new cut face has its counterpart on the other side: no node hangs."""
+    corners = cut_faces(mesh)
     if len(corners) == 0:
         return
     faces = np.sort(_place_numbers(corners), axis=1)
     _, inverse, counts = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
     alone = corners[counts[inverse.ravel()] % 2 == 1].mean(axis=1)
-    lost = alone[~_lie_in(alone, old_lips)]
+    lost = alone[~_lie_in(alone, old_faces)]
     if len(lost):
-        raise ViolationError(
-            f'the face of the cut at {lost[0]} has no counterpart on the other lip'
-        )
+        raise ViolationError(f'the cut face at {lost[0]} has no counterpart on the other side')
 
 
 def _place_numbers(corners: np.ndarray) -> np.ndarray:
-    """One number for each place, shape (k, 3), of corners (k, 3, 3)."""
+    """Return a number for each distinct place, shape (k, 3), of corners (k, 3, 3)."""
     _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     return number.reshape(-1, 3)
 
 
 def _lie_in(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Which points, shape (p, 3), lie in one of some triangles, shape (k, 3, 3), but for
+    """Return which points, shape (p, 3), lie in one of some triangles, shape (k, 3, 3), within
     rounding.
     """
     found = np.zeros(len(points), bool)
@@ -160,7 +157,7 @@ def _lie_in(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def pieces(mesh: TetMesh) -> np.ndarray:
-    """Which face-connected piece each tetrahedron belongs to, shape (m,)."""
+    """Return the face-connected piece of each tetrahedron, shape (m,)."""
     tet, face = np.nonzero(mesh.neighbors >= 0)
     other = mesh.neighbors[tet, face] // 4
     return components(len(mesh.tetrahedra), np.stack([tet, other], axis=1))[1]

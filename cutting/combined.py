@@ -1,23 +1,27 @@
-"""The combined subdivision and separation method (thesis 5.3 to 5.5), and its limiting cases."""
+"""Combined subdivision and separation method (thesis 5.3 to 5.5), with its limiting cases."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from cutting.batch import CutStateError, Scheme, build_batch, give_up_edges
-from cutting.contact import find_hits, met_tetrahedra, surfaces
-from cutting.geometry import smallest_altitudes
-from cutting.lookup import NODES, clear, empty_tables, with_room
-from cutting.method import CutResult, check_sweep
-from cutting.propagation import quad
-from cutting.snapping import Limits, Stroke, conflicts, register
-from cutting.state_table import active_list, pending
-from tissue_sim.blade import Sweep
-from tissue_sim.mesh import TetMesh, grown
+from cutting_trainer.cutting.batch import CutStateError, Scheme, build_batch, give_up_edges
+from cutting_trainer.cutting.broad_phase import quad
+from cutting_trainer.cutting.crossings import find_hits, lengthened, met_tetrahedra, surfaces
+from cutting_trainer.cutting.geometry import smallest_altitudes
+from cutting_trainer.cutting.lookup import NODES, clear, empty_tables, with_room
+from cutting_trainer.cutting.method import CutResult, check_sweep
+from cutting_trainer.cutting.snapping import SnapLimits, SnapStroke, conflicts, register
+from cutting_trainer.cutting.state_table import active_list, pending
+from cutting_trainer.cutting.waiting import settle_waiting
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, grown
 
 _ROOM_FOR_CHILDREN = 6.0
+_NEAR = 0.5
+"""Distance from the surface at which a node with a contradicted side is put on the cut, as a share
+of the median altitude."""
 _ENOUGH = 20000
-"""Elements that a median is taken of."""
+"""Elements in the sample for a median."""
 FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
 
 
@@ -25,11 +29,11 @@ class CombinedMethod:
     """Cuts by cases A to H and by separation along faces, in batches behind the blade.
 
     Args:
-        scheme: which member of the family.
+        scheme: parameters of the method.
 
     Limitations: the visible cut ends about one element behind the blade. A stroke has one sheet in
-        each element: where
-    the blade folds back on its own cut, what it has cut is finished and a new stroke begins.
+        each element: where the blade folds back on its own cut, the stroke is finished and a new
+        one begins.
     """
 
     def __init__(self, scheme: Scheme) -> None:
@@ -39,6 +43,7 @@ class CombinedMethod:
         self._size = (-1, -1)
         self._first_new = 0
         self._queue: list[np.ndarray] = []
+        self._last = np.zeros((4, 3))
         self._direction = np.zeros(3)
         self._active = np.zeros((0, 4), np.int64)
         self._located = False
@@ -46,27 +51,28 @@ class CombinedMethod:
         self._mark = 0
 
     def advance(self, mesh: TetMesh, positions: np.ndarray, sweep: Sweep) -> CutResult:
-        """Cuts along a sweep, up to the elements that the blade is still in."""
+        """Cut along a sweep, except in the elements around the blade."""
         check_sweep(sweep)
         self._queue.append(quad(sweep))
         return self._work(mesh, np.ascontiguousarray(positions, float), finish=False)
 
     def finish(self, mesh: TetMesh, positions: np.ndarray) -> CutResult:
-        """The blade has left: every pending crossing goes into the mesh, and the tables are
-        emptied.
+        """Put all pending crossings into the mesh and clear the tables, after the blade has
+        left.
         """
         result = self._work(mesh, np.ascontiguousarray(positions, float), finish=True)
         self._forget()
         return result
 
     def abort(self) -> None:
-        """Forgets the stroke; the mesh stays as it is."""
+        """Forget the stroke; the mesh stays unchanged."""
         self._queue.clear()
         self._tables = empty_tables()
         self._forget()
 
     def _forget(self) -> None:
         self._size = (-1, -1)
+        self._last = np.zeros((4, 3))
         self._direction = np.zeros(3)
         self._active = np.zeros((0, 4), np.int64)
         self._located = False
@@ -79,8 +85,11 @@ class CombinedMethod:
             met, folded = self._meet(mesh, positions, self._queue[0], tolerant=finish)
             touched += met
             if not folded:
-                self._queue.pop(0)
+                self._last = self._queue.pop(0)
+        if finish or folded:
+            self._round_off(mesh, positions)
         active = self._active[:0] if finish or folded else self._active
+        settle_waiting(active, self._stroke(mesh, positions), self._scheme.subdivides)
         batch = build_batch(mesh, positions, self._tables, active, self._scheme, self._limits())
         self._tables = batch.tables
         if folded:
@@ -93,8 +102,19 @@ class CombinedMethod:
         )
         return CutResult(batch.delta, report)
 
+    def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
+        """Lead the cut on by the reach, where a stroke ends inside the tissue."""
+        reach = self._scheme.reach * self._altitude
+        way = (self._last[2:] - self._last[1::-1]).mean(axis=0)
+        length = float(np.linalg.norm(way))
+        if len(self._active) and min(reach, length) > 0.0:
+            end = self._last[[3, 2, 2, 3]]
+            end[2:] += way * (reach / length)
+            self._meet(mesh, positions, end, tolerant=True)
+        self._last = np.zeros((4, 3))
+
     def _follow(self, mesh: TetMesh) -> list[str]:
-        """Makes room for the mesh, and drops a stroke that belongs to another one."""
+        """Allocate for the mesh, and drop a stroke of another mesh."""
         warnings = []
         if self._tables.counts[NODES] and (mesh.node_count, len(mesh.tetrahedra)) != self._size:
             queue = self._queue.copy()
@@ -119,22 +139,30 @@ class CombinedMethod:
     def _meet(
         self, mesh: TetMesh, positions: np.ndarray, corners: np.ndarray, *, tolerant: bool
     ) -> tuple[int, bool]:
-        """Enters what one sweep crosses; returns how many elements it met, and whether it folded
-        back.
+        """Register the crossings of a sweep; return the number of met elements, and whether it
+        folded back.
         """
-        triangles = surfaces(corners)
         near = np.unique(self._active)
         links, tables = mesh.links, self._tables
         self._mark += 1
         self._seen = grown(self._seen, len(tables.owner))
+        # The mesh cuts short of the blade's ends by this much, in the mean.
+        reach = self._scheme.reach * self._altitude
+        triangles = surfaces(lengthened(corners, reach, reach, back=0.0))
         met = met_tetrahedra(
             triangles, links, positions, near, not self._located, self._seen, self._mark
         )
         self._located |= len(met) > 0
+        active = active_list(corners[3], corners[2], links, tables, positions, met)
+        begins = not tables.counts[NODES]
+        if begins or not (len(self._active) and len(active)):
+            before, after = reach * (len(self._active) > 0), reach * (len(active) > 0)
+            back = before if begins else 0.0
+            triangles = surfaces(lengthened(corners, before, after, back=back))
         nodes, data = find_hits(triangles, links, tables, positions, met)
         self._turn(triangles, corners)
-        direction = self._direction / max(float(np.linalg.norm(self._direction)), 1e-300)
-        if not tolerant and conflicts(tables, nodes, data, direction, positions):
+        stroke = self._stroke(mesh, positions)
+        if not tolerant and conflicts(nodes, data, _NEAR * self._altitude, stroke):
             return len(met), True
         tables = with_room(
             tables,
@@ -144,22 +172,24 @@ class CombinedMethod:
             edges=len(nodes),
             parents=0,
         )
-        limits = self._limits()
-        register(
-            nodes,
-            data,
-            Stroke(direction, links, tables, positions, mesh.rest, mesh.fixed, limits),
-        )
+        register(nodes, data, stroke._replace(tables=tables))
         if not self._scheme.subdivides:
             give_up_edges(tables)
         self._tables = tables
-        self._active = active_list(corners[3], corners[2], links, tables, positions, met)
+        self._active = active
         return len(met), False
 
-    def _limits(self) -> Limits:
+    def _stroke(self, mesh: TetMesh, positions: np.ndarray) -> SnapStroke:
+        """Return the operand of the kernels of snapping."""
+        direction = self._direction / max(float(np.linalg.norm(self._direction)), 1e-300)
+        return SnapStroke(
+            direction, mesh.links, self._tables, positions, mesh.rest, mesh.fixed, self._limits()
+        )
+
+    def _limits(self) -> SnapLimits:
         scheme = self._scheme
         floor = scheme.floor * self._altitude
-        return Limits(
+        return SnapLimits(
             tau=scheme.tau,
             off=scheme.off * self._altitude if scheme.slides else np.inf,
             thin=scheme.thin * self._altitude,
@@ -169,7 +199,7 @@ class CombinedMethod:
         )
 
     def _turn(self, triangles: np.ndarray, corners: np.ndarray) -> None:
-        """Lets the normal of the stroke follow its sweeps, with a memory of about one element."""
+        """Update the normal of the stroke by its sweeps, averaged over about one element."""
         way = float(np.linalg.norm(corners[2:] - corners[1::-1], axis=1).mean())
         direction = self._direction * np.exp(-way / self._altitude)
         for a, b, c in triangles:

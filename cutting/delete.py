@@ -1,29 +1,29 @@
-"""Element deletion, the thesis's own baseline (5.2.1, 7.6.1): it loses mass and leaves a gap."""
+"""Element deletion, the baseline of the thesis (5.2.1, 7.6.1): it loses mass and leaves a gap."""
 
 import numpy as np
 
-from cutting.method import CutResult, Report, removed_volume
-from cutting.propagation import touched_tetrahedra
-from tissue_sim.blade import Sweep
-from tissue_sim.mesh import TetMesh, TopologyDelta
+from cutting_trainer.cutting.broad_phase import touched_tetrahedra
+from cutting_trainer.cutting.method import CutReport, CutResult, removed_volume
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 
 
 class DeleteMethod:
-    """Takes out every tetrahedron that the sweep meets.
+    """Removes every tetrahedron met by the sweep.
 
-    Limitations: removes tissue, the gap is as wide as the elements, and what is left may hang
-    together by a node or an edge only.
+    Limitations: it removes tissue, the gap is as wide as the elements, and the rest may be
+        connected by a node or an edge only.
     """
 
     def advance(self, mesh: TetMesh, positions: np.ndarray, sweep: Sweep) -> CutResult:
-        """Takes out what the sweep meets."""
+        """Remove the tetrahedra met by the sweep."""
         met = touched_tetrahedra(mesh, positions, sweep, None)
-        report = Report(touched=len(met), removed_volume=removed_volume(mesh, met))
+        report = CutReport(touched=len(met), removed_volume=removed_volume(mesh, met))
         return CutResult(TopologyDelta(removed_tetrahedra=met), report)
 
     def finish(self, mesh: TetMesh, positions: np.ndarray) -> CutResult:
-        """Nothing is ever pending."""
-        return CutResult(TopologyDelta(), Report())
+        """Do nothing: no crossing is ever pending."""
+        return CutResult(TopologyDelta(), CutReport())
 
     def abort(self) -> None:
-        """Nothing is ever pending."""
+        """Do nothing: no crossing is ever pending."""

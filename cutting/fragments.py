@@ -1,21 +1,20 @@
-"""Pieces that a batch cuts free, found from the batch outward, in time that does not grow with
-the mesh.
-"""
+"""Detached pieces of a batch, found from the batch outward in time independent of the mesh size."""
 
 import numpy as np
-from numba import njit
+
+from cutting_trainer.node_common.kernels import inner, kernel
 
 SMALL = 48
-"""Pieces of no more tetrahedra than this are noticed."""
+"""Largest number of tetrahedra of a reported piece."""
 
 
-@njit(cache=True)
+@kernel
 def small_pieces(patch, pieces, links):
-    """Sizes of the small pieces, in tetrahedra, that a batch leaves.
+    """Return the sizes of the small detached pieces of a batch, in tetrahedra.
 
     Args:
-        patch: of the batch, with its corners renumbered; holds the face neighbours of all that
-            goes.
+        patch: of the batch, with renumbered corners; it has the face neighbours of all removed
+            elements.
         pieces: the children of the batch.
         links: connectivity before the batch.
 
@@ -28,7 +27,7 @@ def small_pieces(patch, pieces, links):
             place[patch.tetrahedra[e]] = np.int64(e)
     place[np.int64(-1)] = np.int64(-1)
     offset = len(patch.corners)
-    # Elements of the patch go by their index, tetrahedra beyond it by their number + offset.
+    # Elements of the patch are known by index, tetrahedra beyond it by number + offset.
     known = {}
     known[np.int64(-1)] = np.int64(0)
     sizes = [np.int64(0) for _ in range(0)]
@@ -53,12 +52,12 @@ def small_pieces(patch, pieces, links):
                     break
         if 0 < size <= SMALL:
             sizes.append(np.int64(size))
-    return np.array(sizes)
+    return np.array(sizes, np.int64)
 
 
-@njit(cache=True)
+@inner
 def _next(patch, links, place, offset, at, face):
-    """The element across a face, or -1."""
+    """Return the element across a face, or -1."""
     if at < offset:
         across = patch.across[at, face]
         if across >= 0:
@@ -66,7 +65,7 @@ def _next(patch, links, place, offset, at, face):
         if patch.tetrahedra[at] < 0:
             return np.int64(-1)
         other = links.neighbors[patch.tetrahedra[at], face]
-        # What the patch does hold and does not connect, the cut has parted.
+        # Elements in the patch that it does not connect are separated by the cut.
         return np.int64(-1) if other < 0 or other // 4 in place else np.int64(other // 4 + offset)
     other = np.int64(links.neighbors[at - offset, face])
     if other < 0:

@@ -1,19 +1,17 @@
-"""Where the swept blade meets tetrahedra: exact-sign tests of segments, triangles and
-tetrahedra.
-"""
+"""Exact-sign intersection tests of segments, triangles and tetrahedra, for the swept blade."""
 
 import numpy as np
-from numba import njit
 
-from tissue_sim.topology import FACE_NODES
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 EDGE_NODES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 """Local nodes of the six edges of a tetrahedron."""
 
 
-@njit(cache=True)
+@inner
 def height(normal, point, x):
-    """Height of x above the plane through a point with that normal, each shape (3,)."""
+    """Return height of x above the plane through a point with that normal, each shape (3,)."""
     return (
         normal[0] * (x[0] - point[0])
         + normal[1] * (x[1] - point[1])
@@ -21,18 +19,18 @@ def height(normal, point, x):
     )
 
 
-@njit(cache=True)
+@inner
 def orientation(a, b, c, d):
-    """Six times the signed volume of the tetrahedron a b c d [m^3], each shape (3,)."""
+    """Return six times the signed volume of the tetrahedron a b c d [m^3], each shape (3,)."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     wx, wy, wz = d[0] - a[0], d[1] - a[1], d[2] - a[2]
     return ux * (vy * wz - vz * wy) + uy * (vz * wx - vx * wz) + uz * (vx * wy - vy * wx)
 
 
-@njit(cache=True)
+@inner
 def altitude(a, b, c, d):
-    """Smallest altitude of the tetrahedron a b c d [m], negative where it is turned over."""
+    """Return the smallest altitude of the tetrahedron a b c d [m], negative if inverted."""
     largest = 0.0
     for p, q, r in ((a, b, c), (a, b, d), (a, c, d), (b, c, d)):
         ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
@@ -42,9 +40,11 @@ def altitude(a, b, c, d):
     return orientation(a, b, c, d) / np.sqrt(largest)
 
 
-@njit(cache=True)
+@inner
 def segment_meets_triangle(p, q, a, b, c):
-    """Whether the segment p q crosses the triangle a b c or touches it; not for coplanar ones."""
+    """Return whether the segment p q crosses the triangle a b c or touches it; not for coplanar
+    ones.
+    """
     above, below = orientation(a, b, c, p), orientation(a, b, c, q)
     if above * below > 0.0 or (above == 0.0 and below == 0.0):
         return False
@@ -52,7 +52,7 @@ def segment_meets_triangle(p, q, a, b, c):
     return (s >= 0.0 and t >= 0.0 and u >= 0.0) or (s <= 0.0 and t <= 0.0 and u <= 0.0)
 
 
-@njit(cache=True)
+@inner
 def _inside(positions, corners, point):
     for face in range(4):
         a = positions[corners[FACE_NODES[face, 0]]]
@@ -63,9 +63,9 @@ def _inside(positions, corners, point):
     return True
 
 
-@njit(cache=True)
+@inner
 def triangle_meets_tetrahedron(a, b, c, positions, corners):
-    """Whether a triangle and a tetrahedron share a point.
+    """Return whether a triangle and a tetrahedron share a point.
 
     Args:
         a, b, c: corners of the triangle [m], shape (3,).
@@ -96,9 +96,10 @@ def triangle_meets_tetrahedron(a, b, c, positions, corners):
     return _inside(positions, corners, a)
 
 
-@njit(cache=True)
+@inner
 def sweep_meets(quad, positions, corners):
-    """Whether the sweep, two triangles with the diagonal from corner 0 to 2, meets a tetrahedron.
+    """Return whether the sweep, two triangles with the diagonal from corner 0 to 2, meets a
+    tetrahedron.
 
     Args:
         quad: root before, tip before, tip after, root after [m], shape (4, 3).
@@ -110,7 +111,7 @@ def sweep_meets(quad, positions, corners):
     ) or triangle_meets_tetrahedron(quad[0], quad[2], quad[3], positions, corners)
 
 
-@njit(cache=True)
+@kernel
 def _altitudes(rest, tetrahedra, out):
     for k in range(len(out)):
         a, b, c, d = tetrahedra[k, 0], tetrahedra[k, 1], tetrahedra[k, 2], tetrahedra[k, 3]
@@ -118,7 +119,7 @@ def _altitudes(rest, tetrahedra, out):
 
 
 def smallest_altitudes(rest: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Smallest altitude of each tetrahedron [m], shape (m,)."""
+    """Return the smallest altitude of each tetrahedron [m], shape (m,)."""
     out = np.empty(len(tetrahedra))
     _altitudes(rest, tetrahedra, out)
     return out

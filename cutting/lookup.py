@@ -1,36 +1,35 @@
-"""The state table and the look-up tables of a stroke (thesis 5.3.4), as arrays for compiled
-kernels.
+"""State table and look-up tables of a stroke (thesis 5.3.4), as arrays for compiled kernels.
 
-Edges and nodes are known by the node numbers that they had when the stroke began; copies made since
-answer to the
-number of their origin. Rows are only ever added, and all are dropped when the stroke ends.
+Edges and nodes are identified by the node numbers at the start of the stroke; later copies by the
+number of their origin. Rows are only added, and all are dropped at the end of the stroke.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from cutting.cases import MOST_CHILDREN
-from tissue_sim.mesh import grown
+from cutting_trainer.cutting.cases import MAX_CHILDREN
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
 
 MINUS, PLUS, SNAPPED = -1, 1, 2
-"""Side of a node, or that the node is itself on the cut."""
+"""Side of a node, or the node itself is on the cut."""
 PENDING, DONE, BLOCKED = 1, 2, 3
-"""A crossing: reached by the blade, in the mesh, or given up for the sake of the altitude floor."""
+"""State of a crossing: reached by the blade, in the mesh, or given up because of the altitude
+floor."""
+WAITS_PLUS, WAITS_MINUS = 4, 5
+"""An edge crossed at a snapped node that is not on the cut yet; the side of its lower node."""
 NODES, EDGES, PARENTS = 0, 1, 2
 
 
 class Tables(NamedTuple):
-    """Everything that is remembered between the steps of a stroke; `counts` says how many rows are
-    used.
+    """Memory of a stroke between its steps; `counts` has the number of used rows.
 
     Attributes:
         counts: [nodes, edges, parents], shape (3,).
         node_row: row of a node in the look-up table of nodes, or -1, shape (n,).
-        origin: node that a copy was made of, or -1, shape (n,).
-        owner: row in the state table of the parent that a tetrahedron is a child of, or -1, shape
-            (m,).
+        origin: original node of a copy, or -1, shape (n,).
+        owner: row in the state table of the parent of a tetrahedron, or -1, shape (m,).
         label: corners of a child in terms of its parent, see `cases`, shape (m, 4).
         node_id: shape (a,).
         node_side: MINUS, PLUS or SNAPPED, shape (a,).
@@ -42,8 +41,8 @@ class Tables(NamedTuple):
         slide_to, slide: nodes and weights of where a snapped node slides to, shape (a, 4).
         hash_key, hash_row: open addressing, low << 32 | high to row, shape (power of two,).
         edge_nodes: low, high, shape (b, 2).
-        edge_share: where the blade crossed it, from low to high, shape (b,).
-        edge_state: PENDING, DONE or BLOCKED, shape (b,).
+        edge_share: crossing of the blade, from low to high, shape (b,).
+        edge_state: PENDING, DONE, BLOCKED, WAITS_PLUS or WAITS_MINUS, shape (b,).
         edge_normal: of the swept surface, shape (b, 3).
         parent_nodes: shape (c, 4).
         parent_outer: bits of the faces on the original surface, shape (c,).
@@ -80,7 +79,7 @@ class Tables(NamedTuple):
 
 
 def empty_tables() -> Tables:
-    """Tables of a stroke that has not begun."""
+    """Return the tables of a stroke that has not begun."""
     return Tables(
         counts=np.zeros(3, np.int64),
         node_row=np.zeros(0, np.int32),
@@ -105,7 +104,7 @@ def empty_tables() -> Tables:
         parent_outer=np.zeros(64, np.uint8),
         parent_state=np.zeros(64, np.int16),
         parent_area=np.zeros(64),
-        children=np.zeros((64, MOST_CHILDREN), np.int64),
+        children=np.zeros((64, MAX_CHILDREN), np.int64),
         child_count=np.zeros(64, np.int8),
     )
 
@@ -113,7 +112,7 @@ def empty_tables() -> Tables:
 def with_room(
     tables: Tables, *, mesh_nodes: int, tetrahedra: int, nodes: int, edges: int, parents: int
 ) -> Tables:
-    """The same tables with room for a mesh of that size and for so many further rows."""
+    """Return the tables with room for a mesh of that size and for some further rows."""
     a, b, c = (int(tables.counts[i]) + more for i, more in enumerate((nodes, edges, parents)))
     room: dict[str, np.ndarray] = {}
     for name in ('node_row', 'origin'):
@@ -150,27 +149,27 @@ def with_room(
     return larger
 
 
-@njit(cache=True)
+@kernel
 def edge_key(a, b):
-    """One number for an edge."""
+    """Return a number for an edge."""
     return min(a, b) << 32 | max(a, b)
 
 
-# Kernels that are called most take arrays, not `Tables`: numba counts references whenever an array
-# is taken out of a tuple, which costs more than what is done with it.
+# The most frequent kernels take arrays, not `Tables`: numba counts references for every array taken
+# out of a tuple, which costs more than the computation.
 
 
-@njit(cache=True)
+@inner
 def edge_slot(hash_key, key):
-    """Where an edge is, or would be, in the table."""
+    """Return the slot of an edge in the table, used or free."""
     mask = len(hash_key) - 1
-    slot = (key * 0x9E3779B97F4A7C1 >> 17) & mask
+    slot = (int(key) * 0x9E3779B97F4A7C1 >> 17) & mask
     while hash_key[slot] != -1 and hash_key[slot] != key:
         slot = (slot + 1) & mask
     return slot
 
 
-@njit(cache=True)
+@kernel
 def _rehash(tables):
     for row in range(tables.counts[EDGES]):
         key = edge_key(tables.edge_nodes[row, 0], tables.edge_nodes[row, 1])
@@ -179,16 +178,18 @@ def _rehash(tables):
         tables.hash_row[slot] = row
 
 
-@njit(cache=True)
+@kernel
 def find_edge(tables, a, b):
-    """Row of an edge, or -1."""
+    """Return the row of an edge, or -1."""
     slot = edge_slot(tables.hash_key, edge_key(a, b))
     return tables.hash_row[slot] if tables.hash_key[slot] != -1 else -1
 
 
-@njit(cache=True)
-def add_edge(tables, a, b, share, normal):
-    """Enters an edge that the blade crosses, `share` of the way from a to b; returns its row."""
+@inner
+def add_edge(tables, a, b, share, normal, state):
+    """Add an edge crossed by the blade at `share` of the path from a to b, in a state; return its
+    row.
+    """
     row = tables.counts[EDGES]
     tables.counts[EDGES] = row + 1
     key = edge_key(a, b)
@@ -198,15 +199,15 @@ def add_edge(tables, a, b, share, normal):
     tables.edge_nodes[row, 0] = min(a, b)
     tables.edge_nodes[row, 1] = max(a, b)
     tables.edge_share[row] = share if a < b else 1.0 - share
-    tables.edge_state[row] = PENDING
+    tables.edge_state[row] = state
     for i in range(3):
         tables.edge_normal[row, i] = normal[i]
     return row
 
 
-@njit(cache=True)
+@inner
 def add_node(tables, node, side):
-    """Enters a node with its side; returns its row."""
+    """Add a node with its side; return its row."""
     row = tables.counts[NODES]
     tables.counts[NODES] = row + 1
     tables.node_row[node] = row
@@ -220,35 +221,35 @@ def add_node(tables, node, side):
     return row
 
 
-@njit(cache=True)
+@inner
 def origin_of(tables, node):
-    """The node that the stroke knows this one by."""
+    """Return the node's number at the start of the stroke, or that of its origin."""
     return np.int64(tables.origin[node]) if tables.origin[node] >= 0 else np.int64(node)
 
 
-@njit(cache=True)
+@inner
 def side_of(tables, node):
-    """MINUS, PLUS, SNAPPED, or 0 while unknown, of a node by its origin's number."""
+    """Return MINUS, PLUS, SNAPPED, or 0 while unknown, of a node by its origin's number."""
     row = tables.node_row[node]
     return np.int64(tables.node_side[row]) if row >= 0 else np.int64(0)
 
 
-@njit(cache=True)
+@inner
 def is_on_cut(node_row, node_side, node_state, node):
-    """Whether a node, by its origin's number, is snapped and its crossing in the mesh."""
+    """Return whether a node, by its origin's number, is snapped and its crossing is in the mesh."""
     row = node_row[node]
     return row >= 0 and node_side[row] == SNAPPED and node_state[row] == DONE
 
 
-@njit(cache=True)
+@inner
 def on_cut(tables, node):
-    """The same for tables."""
+    """Return whether a node is snapped and its crossing is in the mesh, for `Tables`."""
     return is_on_cut(tables.node_row, tables.node_side, tables.node_state, node)
 
 
-@njit(cache=True)
+@inner
 def on_cut_bits(corners, known, origin, node_row, node_side, node_state):
-    """Bit i: the cut goes through the i-th of four nodes; none from `known` on can be."""
+    """Return bits of the nodes on the cut; nodes from `known` on cannot be."""
     bits = 0
     for i in range(4):
         node = corners[i]
@@ -259,9 +260,11 @@ def on_cut_bits(corners, known, origin, node_row, node_side, node_state):
     return bits
 
 
-@njit(cache=True)
+@inner
 def base_of(tetrahedra, origin, owner, parent_nodes, tet, out):
-    """Nodes, by origin, of the parent of a tetrahedron, or of itself if it has none; shape (4,)."""
+    """Write the nodes, by origin, of the parent of a tetrahedron, or of itself without one; shape
+    (4,).
+    """
     parent = owner[tet]
     for i in range(4):
         if parent >= 0:
@@ -271,15 +274,15 @@ def base_of(tetrahedra, origin, owner, parent_nodes, tet, out):
             out[i] = origin[node] if origin[node] >= 0 else node
 
 
-@njit(cache=True)
+@inner
 def base_nodes(tables, links, tet, out):
-    """The same for tables and links."""
+    """Write the same from tables and links."""
     base_of(links.tetrahedra, tables.origin, tables.owner, tables.parent_nodes, tet, out)
 
 
-@njit(cache=True)
+@kernel
 def clear(tables, first_new, node_count):
-    """Forgets everything; nodes from `first_new` on were made by this stroke."""
+    """Clear all rows; nodes from `first_new` on were created by this stroke."""
     for row in range(tables.counts[NODES]):
         tables.node_row[tables.node_id[row]] = -1
     for node in range(first_new, min(node_count, len(tables.origin))):

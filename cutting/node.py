@@ -1,37 +1,45 @@
-"""The node `cutting`: the service that turns a sweep of the blade into a change of connectivity."""
+"""The node `cutting`: a service that turns a sweep of the blade into a change of connectivity."""
 
 import time
 from collections import Counter, deque
 from pathlib import Path
 
 import numpy as np
-from cutting_trainer_msgs.msg import CutReport, Mesh, MeshDelta
+from cutting_trainer_msgs.msg import CutReport, Mesh, MeshDelta, State
 from cutting_trainer_msgs.srv import Cut, GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from cutting.method import CutResult, SweepError, check_sweep
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from cutting.warm_up import warm_up
-from tissue_sim import ros
-from tissue_sim.blade import Sweep
-from tissue_sim.errors import MeshError
-from tissue_sim.lifecycle import ManagedNode, run
-from tissue_sim.mesh import TetMesh, carried_over, grown
-from tissue_sim.messages import delta_into, mesh_message, packed
-from tissue_sim.parameters import max_nodes_parameter, scene_parameter, seed_parameter
-from tissue_sim.refusals import MessageError, require_frame
-from tissue_sim.replica import BYTES_A_NODE, MeshReplica
-from tissue_sim.scene_file import read_section
-from tissue_sim.stamps import REVISIONS
+from cutting_trainer.cutting.memory import MethodState
+from cutting_trainer.cutting.method import FAILURES, CutResult, SweepError, carry_out
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.warm_up import warm_up
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.errors import MeshError
+from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, run
+from cutting_trainer.node_common.parameters import (
+    scene_parameter,
+    seed_parameter,
+)
+from cutting_trainer.node_common.rejections import MessageError, require_frame, require_tool
+from cutting_trainer.node_common.scene_file import read_section
+from cutting_trainer.node_common.stamps import REVISION_MODULUS
+from cutting_trainer.node_common.timing import FRAME_NICENESS, request_preference
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.contact.tool import CutCommand
+from cutting_trainer.tissue_sim.mesh.replica import BYTES_PER_NODE, MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, carried_over, grown
+from cutting_trainer.tissue_sim.streaming.mesh_follower import max_nodes_parameter
+from cutting_trainer.tissue_sim.streaming.messages import delta_into, mesh_message, packed
+from cutting_trainer.tissue_sim.streaming.state_publisher import StatePublisher
 
-_REMEMBERED = 16
-_PATIENCE = 0.25
-"""How long [s] a request waits for the delta that it has overtaken."""
-_OVERTAKEN = 150
-"""Deltas that a request may have overtaken: for what is farther ahead nobody waits."""
-_ASK_AGAIN = 1.0
-"""[s] after which a whole mesh that was asked for and did not come is asked for again."""
+_KEPT_DISPLACEMENTS = 16
+_REVISION_TIMEOUT_S = 0.25
+"""Time that a request waits for the delta it has overtaken."""
+_MAX_DELTAS_AHEAD = 150
+"""Deltas that a request may have overtaken; a request farther ahead does not wait."""
+_MESH_REPLY_TIMEOUT_S = 1.0
+"""Time after which a request for the full mesh is repeated."""
 
 
 _REASONS = {
@@ -40,28 +48,28 @@ _REASONS = {
     Cut.Response.NOT_READY: 'not ready',
     Cut.Response.INTERNAL: 'the cut failed',
 }
-"""Of requests that are refused, by the code of the answer."""
+"""Reasons of rejected requests, by the code of the response."""
 
 
 class CuttingNode(ManagedNode):
-    """Keeps a replica of the tissue and what the method remembers; see docs/cutting.md."""
+    """Serves cuts with a replica of the tissue and the state of the method; see docs/cutting.md."""
 
     def __init__(self) -> None:
         super().__init__('cutting')
 
     def configure(self) -> None:
-        """Reads the scene, makes the method and the service."""
+        """Read the scene, set up the method and the service."""
         scene = Path(scene_parameter(self))
         seed_parameter(self)
         self._settings = read_section(scene, 'cutting', CuttingSettings)
         warm_up(self._settings)
         self._method = make_method(self._settings)
         most = max_nodes_parameter(self)
-        self._replica, self._largest = MeshReplica(most), BYTES_A_NODE * most
+        self._replica, self._largest = MeshReplica(most), BYTES_PER_NODE * most
         self._mesh: TetMesh | None = None
-        self._displacements: deque[tuple[int, np.ndarray]] = deque(maxlen=_REMEMBERED)
-        self._ahead: np.ndarray | None = None  # displacement of what was answered last
-        self._asked = -_ASK_AGAIN
+        self._displacements: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT_DISPLACEMENTS)
+        self._ahead: np.ndarray | None = None  # displacement after the last answer
+        self._asked = -_MESH_REPLY_TIMEOUT_S
         self._counts: Counter[str] = Counter()
         self._slowest = 0.0
         most = self._largest
@@ -69,15 +77,28 @@ class CuttingNode(ManagedNode):
         self._deltas = ros.listen(
             self, MeshDelta, ros.MESH_UPDATES, self._take_delta, ros.UPDATES, most=most
         )
+        states = self.create_publisher(State, ros.CUTTING_STATE, ros.STREAM)
+        self._states = StatePublisher(states)
         self._get_mesh = self.create_client(GetMesh, ros.GET_MESH)
         ros.introspect(self, self.create_service(Cut, ros.CUT, self._serve))
-        self.create_service(GetMesh, ros.MESH_KEEPERS[0], self._give_mesh)
+        self.create_service(GetMesh, ros.MESH_RECOVERY_SERVICES[0], self._serve_mesh)
         self._diagnostics = ros.Diagnostics(self, self._status)
+
+    def work(self, stop: Stop) -> None:
+        """Serve with the scheduling preference of the simulation: its frames wait for the
+        answers.
+        """
+        self.get_logger().info(request_preference(FRAME_NICENESS))
+        super().work(stop)
+
+    def release(self) -> None:
+        """Wait until a state is published."""
+        self._states.close()
 
     def _take_mesh(self, message: Mesh) -> None:
         require_frame(ros.MESH, message.header.frame_id)
-        # A step that goes back is a new tissue_sim. Any other keyframe is passed over: to load one
-        # that overtakes its deltas would drop the stroke; a missing delta shows in the next one.
+        # A step that goes back is from a new tissue_sim. Other keyframes are ignored: loading one
+        # that overtakes its deltas would drop the stroke. A missing delta shows in the next one.
         if self._mesh is None or message.step < self._replica.step:
             self._load(message)
 
@@ -93,7 +114,7 @@ class CuttingNode(ManagedNode):
             self._mesh = self._replica.mesh()
         except MeshError as error:
             self._mesh = None
-            self.refusals.add(ros.MESH, error)
+            self.rejections.add(ros.MESH, error)
             return
         self._remember()
         self._counts['rebuilt'] += 1
@@ -130,23 +151,23 @@ class CuttingNode(ManagedNode):
 
     @property
     def _asking(self) -> bool:
-        return time.monotonic() - self._asked < _ASK_AGAIN
+        return time.monotonic() - self._asked < _MESH_REPLY_TIMEOUT_S
 
     def _ask_for_mesh(self) -> None:
         if self._asking or not self._get_mesh.service_is_ready():
             return
         self._asked = time.monotonic()
         self._counts['mesh fetched'] += 1
-        self._get_mesh.call_async(GetMesh.Request()).add_done_callback(self._got_mesh)
+        self._get_mesh.call_async(GetMesh.Request()).add_done_callback(self._receive_mesh)
 
-    def _got_mesh(self, future) -> None:  # type: ignore[no-untyped-def]
-        self._asked = -_ASK_AGAIN
+    def _receive_mesh(self, future) -> None:  # type: ignore[no-untyped-def]
+        self._asked = -_MESH_REPLY_TIMEOUT_S
         response = future.result()
         if response is not None and response.success:
             try:
                 self._load(response.mesh)
             except MessageError as error:
-                self.refusals.add(ros.GET_MESH, error)
+                self.rejections.add(ros.GET_MESH, error)
 
     def _serve(self, request: Cut.Request, response: Cut.Response) -> Cut.Response:
         if not self.is_active:
@@ -160,7 +181,7 @@ class CuttingNode(ManagedNode):
             code, result = self._cut(request)
         except SweepError as error:
             code, result = (Cut.Response.INVALID_SWEEP, str(error)), None
-        except (MeshError, AssertionError, ValueError, KeyError, IndexError) as error:
+        except FAILURES as error:
             self._rebuild('a cut failed')
             code, result = (Cut.Response.INTERNAL, f'{type(error).__name__}: {error}'), None
         response.success = code[0] == Cut.Response.OK
@@ -171,12 +192,12 @@ class CuttingNode(ManagedNode):
             response.report = self._report(result, time.perf_counter() - begun)
             self._counts['cuts'] += 1
         else:
-            self.refusals.add(ros.CUT, MessageError(_REASONS[code[0]], response.error_msg))
+            self.rejections.add(ros.CUT, MessageError(_REASONS[code[0]], response.error_msg))
         self._slowest = max(self._slowest, time.perf_counter() - begun)
         return response
 
-    def _give_mesh(self, _: GetMesh.Request, response: GetMesh.Response) -> GetMesh.Response:
-        """The tissue as it was, with the last cut that was answered, for a new `tissue_sim`."""
+    def _serve_mesh(self, _: GetMesh.Request, response: GetMesh.Response) -> GetMesh.Response:
+        """Return the tissue with the last answered cut, for a new `tissue_sim`."""
         mesh, replica = self._mesh, self._replica
         if mesh is None:
             return response
@@ -190,8 +211,8 @@ class CuttingNode(ManagedNode):
         return response
 
     def _catch_up(self, revision: int) -> None:
-        """Takes the deltas up to a revision: a request may overtake the one it belongs to."""
-        deadline = time.monotonic() + _PATIENCE
+        """Apply the deltas up to a revision: a request may overtake its delta."""
+        deadline = time.monotonic() + _REVISION_TIMEOUT_S
         while self._mesh is not None and self._overtaken(revision) and not self._asking:
             if time.monotonic() > deadline:
                 return
@@ -201,42 +222,45 @@ class CuttingNode(ManagedNode):
                 else:
                     self._take_delta(delta)
             except MessageError as error:
-                self.refusals.add(ros.MESH_UPDATES, error)
+                self.rejections.add(ros.MESH_UPDATES, error)
 
     def _overtaken(self, revision: int) -> bool:
-        """Whether the deltas up to a revision are on their way."""
-        ahead = (revision - self._replica.revision) % REVISIONS
-        return 0 < ahead <= _OVERTAKEN
+        """Return whether the deltas up to a revision are on their way."""
+        ahead = (revision - self._replica.revision) % REVISION_MODULUS
+        return 0 < ahead <= _MAX_DELTAS_AHEAD
 
     def _cut(self, request: Cut.Request) -> tuple[tuple[int, str], CutResult | None]:
         if self._mesh is None:
             return (Cut.Response.NOT_READY, 'no mesh has come yet on tissue/mesh'), None
+        try:
+            require_tool('Cut', request.tool)
+        except MessageError as error:
+            return (Cut.Response.INVALID_SWEEP, str(error)), None
+        if request.command == Cut.Request.ABORT:
+            self._rebuild('the requester aborted the stroke')
+            return (Cut.Response.OK, ''), CutResult.nothing()
         displacement = dict(self._displacements).get(request.revision)
         if displacement is None or len(displacement) != len(self._replica.rest):
-            if (request.revision - self._replica.revision) % REVISIONS > _OVERTAKEN:
-                self._ask_for_mesh()  # the revision here may never have been one
+            if (request.revision - self._replica.revision) % REVISION_MODULUS > _MAX_DELTAS_AHEAD:
+                self._ask_for_mesh()  # the revision of this replica may be invalid
             first, last = self._displacements[0][0], self._displacements[-1][0]
             text = f'revision {request.revision} is not at hand; revisions {first} to {last} are'
             text += ', and the whole mesh has been asked for' if self._asking else ''
             return (Cut.Response.WRONG_REVISION, text), None
         if self._mesh.topology != self._replica.topology:
-            # Who asks has been given the last answer, or has given it up: what it knows counts.
-            self._rebuild('the last change was not taken over')
+            # The requester has applied the last answer or dropped it: its mesh counts.
+            self._rebuild('the last change was not applied')
         if self._mesh is None:
             return (Cut.Response.NOT_READY, 'the mesh could not be used'), None
         positions = self._mesh.rest + displacement
-        if request.command == Cut.Request.ABORT:
-            self._method.abort()
+        if request.command == Cut.Request.STATE:
+            self._states.publish(MethodState(self._method, self._mesh).state(), request.step)
             return (Cut.Response.OK, ''), CutResult.nothing()
-        if request.command == Cut.Request.FINISH:
-            result = self._method.finish(self._mesh, positions)
-        elif request.command == Cut.Request.ADVANCE:
-            sweep = Sweep(request.root_from, request.tip_from, request.root_to, request.tip_to)
-            check_sweep(sweep)
-            result = self._method.advance(self._mesh, positions, sweep)
-        else:
-            text = f'command {request.command} is none of ADVANCE 0, FINISH 1, ABORT 2'
+        if request.command not in list(CutCommand):
+            text = f'command {request.command} is none of ADVANCE 0, FINISH 1, ABORT 2, STATE 3'
             return (Cut.Response.INVALID_SWEEP, text), None
+        sweep = Sweep(request.root_from, request.tip_from, request.root_to, request.tip_to)
+        result = carry_out(self._method, self._mesh, positions, CutCommand(request.command), sweep)
         if not result.delta.empty:
             count = self._mesh.node_count
             touched = self._mesh.apply(result.delta)
@@ -273,7 +297,7 @@ class CuttingNode(ManagedNode):
 
 
 def main() -> None:
-    """Runs the node."""
+    """Run the node."""
     run(CuttingNode)
 
 

@@ -1,25 +1,27 @@
-"""Snapped nodes slide onto the swept surface, in the rest shape (docs/cutting.md)."""
+"""Sliding of snapped nodes onto the swept surface, in the rest shape (docs/cutting.md)."""
 
 import numpy as np
-from numba import njit
 
-from cutting.geometry import altitude, height
-from cutting.lookup import SNAPPED, base_of
-from tissue_sim.topology import CUT
+from cutting_trainer.cutting.geometry import altitude, height
+from cutting_trainer.cutting.lookup import SNAPPED, base_of
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.topology import CUT
 
-_LEAST_ALTITUDE_LEFT = 0.4
+_MIN_ALTITUDE_LEFT = 0.4
 _FLAT = 1e-10
-_STEEPEST = 0.2
-"""Least sine between the swept surface and what a node slides along."""
+_MAX_INCLINATION = 0.2
+"""Smallest sine between the swept surface and the direction of sliding."""
+_MIN_EDGE_SINE = 1e-5
+"""Smallest sine between the triangles at an edge of the tissue; less is rounding."""
 _SMOOTH = 0.8
-"""Least cosine between the triangles at a node and the plane that touches the surface there."""
+"""Smallest cosine between the triangles at a node and the tangent plane of the surface there."""
 _BEYOND = -0.3
-"""Least weight of a node of the tetrahedron that a node slides into."""
+"""Smallest weight of a node of the tetrahedron into which a node slides."""
 
 
-@njit(cache=True)
-def star_of(node, links, tables):
-    """Parents, and whole tetrahedra, around a node by their nodes, that node first.
+@inner
+def incident_tetrahedra(node, links, tables):
+    """Return the parents and whole tetrahedra around a node by their nodes, that node first.
 
     Args:
         node: by its origin's number, and not on the cut.
@@ -63,15 +65,15 @@ def star_of(node, links, tables):
     return star[:count]
 
 
-@njit(cache=True)
+@inner
 def rest_plane(star, normal, point, positions, rest, out):
-    """The swept surface at a node, as a plane of the rest shape.
+    """Compute the swept surface at a node, as a plane of the rest shape.
 
-    The height above a plane of the deformed tissue is a linear function in each element; its mean
-    gradient in the rest shape, by volume, is the normal there.
+    The height above a plane of the deformed tissue is linear in each element. Its volume-weighted
+    mean gradient in the rest shape is the normal.
 
     Args:
-        star: as from `star_of`, shape (s, 4).
+        star: as from `incident_tetrahedra`, shape (s, 4).
         normal, point: of the plane in the deformed tissue [m], shape (3,).
         positions, rest: nodes now and at rest [m], shape (n, 3).
         out: unit normal, height of the node above the plane [m], shape (4,).
@@ -101,7 +103,7 @@ def rest_plane(star, normal, point, positions, rest, out):
     out[3] = above * volume / length
 
 
-@njit(cache=True)
+@inner
 def _put(x, node, rest, at, where):
     if node in at:
         row = at[node]
@@ -112,9 +114,9 @@ def _put(x, node, rest, at, where):
             x[i] = rest[node, i]
 
 
-@njit(cache=True)
+@inner
 def _volume_gradient(star, rest, at, where, out):
-    """Twice the inward area at a node: what it moves at right angles to this keeps the volume."""
+    """Compute twice the inward area at a node: motion orthogonal to it preserves the volume."""
     a, b, c = np.empty(3), np.empty(3), np.empty(3)
     out[:] = 0.0
     for k in range(len(star)):
@@ -128,9 +130,11 @@ def _volume_gradient(star, rest, at, where, out):
         out[2] += ux * vy - uy * vx
 
 
-@njit(cache=True)
+@inner
 def _surface_normals(node, links, rest):
-    """Unit normals of the surface triangles at a node, then 1 for an earlier cut, shape (k, 4)."""
+    """Return unit normals of the surface triangles at a node, then 1 for an earlier cut, shape (k,
+    4).
+    """
     first_corner, corner_next, face_triangle = (
         links.first_corner,
         links.corner_next,
@@ -166,15 +170,15 @@ def _surface_normals(node, links, rest):
     return normals
 
 
-@njit(cache=True)
+@inner
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True)
+@inner
 def _keeps_shape(way, normals, shape):
-    """Whether a node that goes that way leaves the surface by no more than `shape` [m]; an
-    earlier cut is kept but for rounding.
+    """Return whether a sliding node leaves the surface by at most `shape` [m], and an earlier cut
+    only by rounding.
     """
     length = np.sqrt(_dot(way, way))
     for k in range(len(normals)):
@@ -184,25 +188,30 @@ def _keeps_shape(way, normals, shape):
     return True
 
 
-@njit(cache=True)
-def _along(direction, plane, way):
-    """The way along a direction (of any length) to the plane; whether it is not too oblique."""
+@inner
+def _along(direction, plane, least, way):
+    """Compute the path along a direction to the plane.
+
+    Return whether it is not too oblique, and the direction longer than `least`: a shorter one is
+    rounding.
+    """
     size = np.sqrt(_dot(direction, direction))
     rise = _dot(plane, direction)
-    if abs(rise) <= _STEEPEST * size or size == 0.0:
+    if abs(rise) <= _MAX_INCLINATION * size or size <= least:
         return False
     for i in range(3):
         way[i] = -plane[3] * direction[i] / rise
     return True
 
 
-@njit(cache=True)
-def find_way(star, plane, links, rest, fixed, shape, at, where, way):
-    """The shortest way of a node onto the swept surface that keeps the outer shape and the volume.
+@inner
+def find_slide(star, plane, links, rest, fixed, shape, at, where, way):
+    """Find the shortest path of a node onto the swept surface that preserves outer shape and
+    volume.
 
-    Inside the tissue it is at right angles to the surface that is swept; at the tissue's surface it
-    is in the plane that touches it there; at an edge of the tissue it is along that edge. The end
-    of an earlier cut, where both lips meet, stays where it is.
+    Inside the tissue it is orthogonal to the swept surface. At the tissue's surface it lies in the
+    tangent plane, and at an edge of the tissue along that edge. The end of an earlier cut, where
+    both cut faces meet, stays in place.
 
     Args:
         star: around the node, shape (s, 4).
@@ -210,19 +219,19 @@ def find_way(star, plane, links, rest, fixed, shape, at, where, way):
         links: connectivity.
         rest: [m], shape (n, 3).
         fixed: shape (n,).
-        shape: how far the node may leave the present surface [m].
+        shape: largest distance of the node from the present surface [m].
         at, where: row by node, and places [m], shape (j, 3), of nodes that slide in this batch.
         way: output [m], shape (3,).
 
     Returns:
-        Whether there is one.
+        Whether a path exists.
     """
     node = star[0, 0]
     if fixed[node]:
         return False
     normals = _surface_normals(node, links, rest)
     if len(normals) == 0:
-        return _along(plane[:3], plane, way)
+        return _along(plane[:3], plane, 0.0, way)
     across = np.zeros(3)
     sharpest = 0.0
     turn = np.empty(3)
@@ -236,7 +245,7 @@ def find_way(star, plane, links, rest, fixed, shape, at, where, way):
         turn[2] = a[0] * b[1] - a[1] * b[0]
         if _dot(turn, turn) > sharpest:
             sharpest = _dot(turn, turn)
-            across[:] = turn
+            across[0], across[1], across[2] = turn[0], turn[1], turn[2]
     inward, tangent = np.empty(3), np.empty(3)
     _volume_gradient(star, rest, at, where, inward)
     size = np.sqrt(_dot(inward, inward))
@@ -246,14 +255,18 @@ def find_way(star, plane, links, rest, fixed, shape, at, where, way):
         tangent[i] = plane[i] - share * inward[i]
     for k in range(len(normals)):
         smooth &= _dot(normals[k], inward) < -_SMOOTH * size
-    if smooth and _along(tangent, plane, way) and _keeps_shape(way, normals, shape):
+    if (
+        smooth
+        and _along(tangent, plane, _MAX_INCLINATION, way)
+        and _keeps_shape(way, normals, shape)
+    ):
         return True
-    return sharpest > 0.0 and _along(across, plane, way) and _keeps_shape(way, normals, 0.0)
+    return _along(across, plane, _MIN_EDGE_SINE, way) and _keeps_shape(way, normals, 0.0)
 
 
-@njit(cache=True)
+@inner
 def stays_sound(star, target, rest, floor, at, where):
-    """Whether no element around a node gets much flatter when the node goes to `target` [m]."""
+    """Return whether no element around a node gets much flatter when it moves to `target` [m]."""
     corners = np.empty((4, 3))
     for k in range(len(star)):
         for i in range(4):
@@ -261,14 +274,16 @@ def stays_sound(star, target, rest, floor, at, where):
         before = altitude(corners[0], corners[1], corners[2], corners[3])
         corners[0] = target
         after = altitude(corners[0], corners[1], corners[2], corners[3])
-        if after < max(floor, _LEAST_ALTITUDE_LEFT * before):
+        if after < max(floor, _MIN_ALTITUDE_LEFT * before):
             return False
     return True
 
 
-@njit(cache=True)
+@inner
 def can_slide(star, plane, links, tables, rest, fixed, shape, floor):
-    """Whether a node could slide onto the swept surface, when the snapped nodes around it do."""
+    """Return whether a node could slide onto the swept surface if the snapped nodes around it
+    do.
+    """
     at: dict[int, int] = {}
     at[-1] = 0
     where = np.empty((3 * len(star), 3))
@@ -284,14 +299,17 @@ def can_slide(star, plane, links, tables, rest, fixed, shape, floor):
                     where[count, j] = rest[node, j] - there[3] * there[j]
                 count += 1
     way = np.empty(3)
-    if not find_way(star, plane, links, rest, fixed, shape, at, where, way):
+    if not find_slide(star, plane, links, rest, fixed, shape, at, where, way):
         return False
     return stays_sound(star, rest[star[0, 0]] + way, rest, floor, at, where)
 
 
-@njit(cache=True)
+@inner
 def _express(node, target, links, rest, nodes, weights):
-    """Nodes and weights for a place, in the tetrahedron at a node that it is in, or beyond, most.
+    """Compute nodes and weights for a place, in the tetrahedron at a node that contains it or is
+    nearest.
+
+    Return whether it is in or near one.
 
     Returns:
         Whether it is in or near the cone of one.
@@ -327,13 +345,12 @@ def _express(node, target, links, rest, nodes, weights):
     return best > _BEYOND
 
 
-@njit(cache=True)
+@kernel
 def slides(rows, links, tables, rest, fixed, limits):
-    """Which nodes slide onto the swept surface; a node that would spoil an element stays where it
-    is.
+    """Return the sliding nodes; a node that would spoil an element stays in place.
 
     Args:
-        rows: of nodes that are newly on the cut, shape (k,); where to is written to `tables`.
+        rows: of nodes newly on the cut, shape (k,); the target is written to `tables`.
         links, tables: mesh and stroke.
         rest: [m], shape (n, 3).
         fixed: shape (n,).
@@ -353,8 +370,8 @@ def slides(rows, links, tables, rest, fixed, limits):
         if plane[3] == 0.0:
             continue
         node = tables.node_id[row]
-        star = star_of(node, links, tables)
-        if not find_way(star, plane, links, rest, fixed, limits.shape, at, where, way):
+        star = incident_tetrahedra(node, links, tables)
+        if not find_slide(star, plane, links, rest, fixed, limits.shape, at, where, way):
             continue
         nodes, weights = tables.slide_to[row], tables.slide[row]
         if not _express(node, rest[node] + way, links, rest, nodes, weights):

@@ -1,38 +1,43 @@
-"""Node-first snapping (thesis 5.3.3; docs/cutting.md): which nodes the cut goes through."""
+"""Node-first snapping (thesis 5.3.3; docs/cutting.md): selection of the nodes on the cut."""
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from cutting.geometry import altitude, height
-from cutting.lookup import (
+from cutting_trainer.cutting.geometry import altitude, height
+from cutting_trainer.cutting.lookup import (
+    DONE,
+    EDGES,
     MINUS,
     PENDING,
     PLUS,
     SNAPPED,
+    WAITS_MINUS,
+    WAITS_PLUS,
     Tables,
     add_edge,
     add_node,
     base_of,
     side_of,
 )
-from cutting.sliding import can_slide, rest_plane, star_of
-from tissue_sim.topology import CUT, Links
+from cutting_trainer.cutting.sliding import can_slide, incident_tetrahedra, rest_plane
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.topology import CUT, Links
 
 _EXACT = 1e-6
 
 
-class Limits(NamedTuple):
-    """What decides whether a node goes to the cut.
+class SnapLimits(NamedTuple):
+    """Limits for snapping a node to the cut.
 
     Attributes:
-        tau: a crossing nearer to a node than this share of its edge goes to the node.
-        off: how far from the surface a node on the cut may stay that cannot slide onto it [m].
-        thin: no such node is left off the cut for an element that would be flatter than this [m].
+        tau: a crossing nearer to a node than this share of its edge is snapped to the node.
+        off: largest distance from the surface of a node on the cut that cannot slide onto it [m].
+        thin: such a node stays on the cut where an element would otherwise be flatter than this
+            [m].
         small: altitude of an element below which only nodes are cut [m].
         floor: smallest altitude of a new element [m].
-        shape: how far a node may leave the surface of the tissue [m].
+        shape: largest distance of a node from the surface of the tissue [m].
     """
 
     tau: float
@@ -43,15 +48,15 @@ class Limits(NamedTuple):
     shape: float
 
 
-class Stroke(NamedTuple):
-    """A step of a stroke, for the kernels of this module.
+class SnapStroke(NamedTuple):
+    """A step of a stroke, as operand of the kernels.
 
     Attributes:
         direction: normal of the stroke so far, unit, shape (3,).
         links, tables: mesh and stroke.
         positions, rest: nodes now and at rest [m], shape (n, 3).
         fixed: shape (n,).
-        limits: see `Limits`.
+        limits: see `SnapLimits`.
     """
 
     direction: np.ndarray
@@ -60,50 +65,25 @@ class Stroke(NamedTuple):
     positions: np.ndarray
     rest: np.ndarray
     fixed: np.ndarray
-    limits: Limits
+    limits: SnapLimits
 
 
-@njit(cache=True)
+@inner
 def _oriented(normal, direction):
-    """The normal, turned to the side that the stroke's normals have been on so far."""
+    """Return the normal, oriented as the stroke's previous normals."""
     dot = normal[0] * direction[0] + normal[1] * direction[1] + normal[2] * direction[2]
     return normal if dot >= 0.0 else -normal
 
 
-@njit(cache=True)
-def conflicts(tables, nodes, data, direction, positions):
-    """How many hits contradict the sides that nodes are on already: the blade folds back on its own
-    cut.
-
-    Args:
-        tables: of the stroke.
-        nodes, data: hits, as from `find_hits`.
-        direction: normal of the stroke so far, shape (3,).
-        positions: current nodes [m], shape (n, 3).
-    """
-    count = 0
-    for k in range(len(nodes)):
-        normal = _oriented(data[k, 1:4], direction)
-        a, b = nodes[k, 0], nodes[k, 1]
-        sides = side_of(tables, a), (side_of(tables, b) if b >= 0 else np.int64(0))
-        if b < 0:
-            count += abs(sides[0]) == 1
-            continue
-        if sides[0] == SNAPPED or sides[1] == SNAPPED:
-            continue
-        side = PLUS if height(normal, data[k, 4:7], positions[a]) > 0.0 else MINUS
-        count += sides[0] == -side or sides[1] == side
-    return count
-
-
-@njit(cache=True)
+@inner
 def _nearness(star, point, stroke):
-    """How near to a node the surface, continued as a plane, crosses its edges.
+    """Return the proximity of a node to the crossings of its edges with the surface, continued as a
+    plane.
 
     Args:
-        star: around the node, see `star_of`.
+        star: around the node, see `incident_tetrahedra`.
         point: of the surface [m], shape (3,).
-        stroke: a `Stroke`.
+        stroke: a `SnapStroke`.
 
     Returns:
         Least share of an edge, 1 if none is crossed; and the least altitude around the node [m].
@@ -124,15 +104,16 @@ def _nearness(star, point, stroke):
     return (0.0 if abs(above) <= _EXACT * longest else nearest), smallest
 
 
-@njit(cache=True)
+@inner
 def _is_near(node, point, stroke):
-    """Whether a node goes to the cut: the surface crosses one of its edges within tau of it.
+    """Return whether a node snaps to the cut: the surface crosses one of its edges within tau of
+    it.
 
-    Where it could not slide onto the surface, it has to be nearer. In small elements half an edge
-    is near enough: then only nodes are cut, and no element gets smaller.
+    A node that could not slide onto the surface must be nearer. In small elements half an edge is
+    near enough: then only nodes are cut, and no element gets smaller.
     """
     limits = stroke.limits
-    star = star_of(node, stroke.links, stroke.tables)
+    star = incident_tetrahedra(node, stroke.links, stroke.tables)
     nearest, smallest = _nearness(star, point, stroke)
     if limits.tau == 0.5 or smallest < limits.small:
         return nearest <= 0.5
@@ -154,9 +135,9 @@ def _is_near(node, point, stroke):
     )
 
 
-@njit(cache=True)
-def _on_lip(links, node):
-    """Whether a node lies on the surface of an earlier cut."""
+@inner
+def _on_cut_face(links, node):
+    """Return whether a node lies on the surface of an earlier cut."""
     face_triangle, kind, corner_next = links.face_triangle, links.triangle_kind, links.corner_next
     corner = links.first_corner[node]
     while corner >= 0:
@@ -169,9 +150,9 @@ def _on_lip(links, node):
     return False
 
 
-@njit(cache=True)
+@inner
 def _decide(node, hit, stroke):
-    """Settles whether a node is on the cut, else which side it is on; returns its row."""
+    """Decide whether a node is on the cut, else on which side; return its row."""
     tables = stroke.tables
     row = np.int64(tables.node_row[node])
     if row >= 0:
@@ -179,29 +160,92 @@ def _decide(node, hit, stroke):
     if not _is_near(node, hit[4:7], stroke):
         above = height(hit[1:4], hit[4:7], stroke.positions[node])
         return np.int64(add_node(tables, node, PLUS if above > 0.0 else MINUS))
-    row = np.int64(add_node(tables, node, SNAPPED))
+    row = np.int64(add_node(tables, node, np.int64(SNAPPED)))
     _lay_plane(row, hit, stroke)
-    if _on_lip(stroke.links, node):
+    if _on_cut_face(stroke.links, node):
         tables.node_state[row] = PENDING
     return row
 
 
-@njit(cache=True)
+@inner
 def _lay_plane(row, hit, stroke):
-    """Remembers the surface at a snapped node."""
+    """Store the surface at a snapped node."""
     tables, positions = stroke.tables, stroke.positions
     node = tables.node_id[row]
-    tables.node_plane[row, :3] = hit[1:4]
+    for axis in range(3):
+        tables.node_plane[row, axis] = hit[1 + axis]
     tables.node_plane[row, 3] = height(hit[1:4], hit[4:7], positions[node])
-    star = star_of(node, stroke.links, tables)
+    star = incident_tetrahedra(node, stroke.links, tables)
     rest_plane(star, hit[1:4], hit[4:7], positions, stroke.rest, tables.rest_plane[row])
 
 
-@njit(cache=True)
-def _join_old_front(a, b, hit, stroke):
-    """Nodes of an earlier cut, near the surface and in an element at a and b, are on it at once.
+@inner
+def _can_join(tables, node):
+    """Return whether a node with a side can still be put on the cut: none of its edges is cut."""
+    for row in range(tables.counts[EDGES]):
+        if tables.edge_state[row] == DONE and (
+            tables.edge_nodes[row, 0] == node or tables.edge_nodes[row, 1] == node
+        ):
+            return False
+    return True
 
-    Otherwise a bridge is left between where one stroke ended and where the next begins.
+
+@inner
+def _contradicts(node, side, hit, normal, near, stroke):
+    """Return whether a hit puts a node on another side than it has.
+
+    A node nearly on the surface is put on the cut instead: the surface is curved, and has passed an
+    edge of it twice, or follows an earlier cut.
+    """
+    tables = stroke.tables
+    row = tables.node_row[node]
+    if row < 0 or tables.node_side[row] == SNAPPED or tables.node_side[row] == side:
+        return False
+    above = abs(height(normal, hit[4:7], stroke.positions[node]))
+    if above > near or not _can_join(tables, node):
+        return True
+    tables.node_side[row] = SNAPPED
+    tables.node_state[row] = PENDING
+    _lay_plane(row, hit, stroke)
+    for k in range(tables.counts[EDGES]):
+        for i in range(2):
+            if tables.edge_nodes[k, i] == node and tables.edge_state[k] == PENDING:
+                low_plus = (side == MINUS) == (i == 0)
+                tables.edge_state[k] = WAITS_PLUS if low_plus else WAITS_MINUS
+    return False
+
+
+@kernel
+def conflicts(nodes, data, near, stroke):
+    """Return the number of hits that contradict known sides of nodes: the blade folds back on its
+    own cut.
+
+    Args:
+        nodes, data: hits, as from `find_hits`.
+        near: distance from the surface within which a node may be put on the cut instead [m].
+        stroke: with tables that are changed for these nodes.
+    """
+    tables, direction, positions = stroke.tables, stroke.direction, stroke.positions
+    count = 0
+    for k in range(len(nodes)):
+        normal = _oriented(data[k, 1:4], direction)
+        a, b = nodes[k, 0], nodes[k, 1]
+        if b < 0:
+            count += _contradicts(a, SNAPPED, data[k], normal, near, stroke)
+            continue
+        if side_of(tables, a) == SNAPPED or side_of(tables, b) == SNAPPED:
+            continue
+        side = PLUS if height(normal, data[k, 4:7], positions[a]) > 0.0 else MINUS
+        one = _contradicts(a, side, data[k], normal, near, stroke)
+        count += one or _contradicts(b, -side, data[k], normal, near, stroke)
+    return count
+
+
+@inner
+def _join_old_front(a, b, hit, stroke):
+    """Snap the nodes of an earlier cut near the surface, in an element at a and b.
+
+    Otherwise a bridge would remain between the end of one stroke and the start of the next.
     """
     links, tables = stroke.links, stroke.tables
     base = np.empty(4, np.int64)
@@ -214,13 +258,17 @@ def _join_old_front(a, b, hit, stroke):
         if base[0] != b and base[1] != b and base[2] != b and base[3] != b:
             continue
         for node in base:
-            if node_row[node] < 0 and _on_lip(links, node) and _is_near(node, hit[4:7], stroke):
+            if (
+                node_row[node] < 0
+                and _on_cut_face(links, node)
+                and _is_near(node, hit[4:7], stroke)
+            ):
                 _decide(node, hit, stroke)
 
 
-@njit(cache=True)
+@inner
 def _reach(row, other, share, hit, stroke):
-    """The blade crosses an edge of a snapped node, `share` of the way to `other`."""
+    """Update a snapped node whose edge the blade crosses, at `share` of the path to `other`."""
     tables, positions = stroke.tables, stroke.positions
     node = tables.node_id[row]
     if share <= 0.5 and tables.node_state[row] == 0:
@@ -235,18 +283,27 @@ def _reach(row, other, share, hit, stroke):
             tables.rest_plane[row, 3] = 0.0
 
 
-@njit(cache=True)
+@inner
+def _waits(tables, row):
+    """Return whether a node is snapped, but not on the cut yet."""
+    return tables.node_side[row] == SNAPPED and tables.node_state[row] != DONE
+
+
+@kernel
 def register(nodes, data, stroke):
-    """Enters hits in the look-up tables; hits that contradict known sides are passed over.
+    """Add hits to the look-up tables; hits that contradict known sides are ignored.
 
     Args:
         nodes, data: hits, as from `find_hits`; their normals are turned to the stroke's side.
-        stroke: with tables that have room for two nodes and an edge by hit and their rings.
+        stroke: with tables that have room for two nodes and an edge per hit and their incident
+            tetrahedra.
     """
     tables = stroke.tables
     for k in range(len(nodes)):
         hit = data[k]
-        hit[1:4] = _oriented(hit[1:4], stroke.direction)
+        normal = _oriented(hit[1:4], stroke.direction)
+        for axis in range(3):
+            hit[1 + axis] = normal[axis]
         a, b = nodes[k, 0], nodes[k, 1]
         first = _decide(a, hit, stroke)
         if b < 0:
@@ -258,5 +315,9 @@ def register(nodes, data, stroke):
             if tables.node_side[row] == SNAPPED:
                 _reach(row, other, share, hit, stroke)
         if tables.node_side[first] == -tables.node_side[second]:
-            add_edge(tables, a, b, hit[0], hit[1:4])
+            add_edge(tables, a, b, hit[0], hit[1:4], PENDING)
             _join_old_front(a, b, hit, stroke)
+        elif _waits(tables, first) or _waits(tables, second):
+            low = stroke.positions[min(a, b)]
+            above = height(hit[1:4], hit[4:7], low) > 0.0
+            add_edge(tables, a, b, hit[0], hit[1:4], WAITS_PLUS if above else WAITS_MINUS)

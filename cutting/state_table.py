@@ -1,37 +1,39 @@
-"""The state table (thesis 5.3.4): parents of the stroke, their crossings, and the tetrahedra
-they consist of now.
+"""State table (thesis 5.3.4): parents of the stroke, their crossings, and their present
+tetrahedra.
 """
 
 import numpy as np
-from numba import njit
 
-from cutting.contact import segment_meets
-from cutting.geometry import EDGE_NODES
-from cutting.lookup import (
+from cutting_trainer.cutting.crossings import segment_meets
+from cutting_trainer.cutting.geometry import EDGE_NODES
+from cutting_trainer.cutting.lookup import (
     BLOCKED,
     DONE,
     EDGES,
     NODES,
     PARENTS,
     PENDING,
+    SNAPPED,
+    WAITS_PLUS,
     base_nodes,
     edge_key,
     find_edge,
     on_cut,
     origin_of,
 )
-from tissue_sim.topology import OUTER
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.topology import OUTER
 
 
-@njit(cache=True)
+@kernel
 def active_list(root, tip, links, tables, positions, met):
-    """Tetrahedra of the stroke's beginning that the blade is in now, by their nodes (thesis 5.4).
+    """Return the stroke's original tetrahedra around the blade, by their nodes (thesis 5.4).
 
     Args:
         root, tip: the blade's edge [m], shape (3,).
         links, tables: mesh and stroke.
         positions: current nodes [m], shape (n, 3).
-        met: tetrahedra that the sweep met, shape (t,).
+        met: tetrahedra met by the sweep, shape (t,).
 
     Returns:
         Shape (a, 4).
@@ -51,16 +53,16 @@ def active_list(root, tip, links, tables, positions, met):
     return active[:count]
 
 
-@njit(cache=True)
+@kernel
 def non_active_crossings(active, tables):
-    """Marks the crossings that the blade has left as belonging to the mesh.
+    """Mark the crossings that the blade has left as part of the mesh.
 
     Args:
-        active: nodes of the tetrahedra that the blade is in, shape (a, 4).
+        active: nodes of the tetrahedra around the blade, shape (a, 4).
         tables: of the stroke.
 
     Returns:
-        Rows of the edges, and of the nodes, that go from PENDING to DONE.
+        Rows of the edges, and of the nodes, that change from PENDING to DONE.
     """
     held = {np.int64(-1)}
     for k in range(len(active)):
@@ -80,12 +82,12 @@ def non_active_crossings(active, tables):
         if tables.node_state[row] == PENDING and key not in held:
             tables.node_state[row] = DONE
             nodes.append(np.int64(row))
-    return np.array(edges), np.array(nodes)
+    return np.array(edges, np.int64), np.array(nodes, np.int64)
 
 
-@njit(cache=True)
+@kernel
 def pending(tables):
-    """How many crossings the mesh does not have yet."""
+    """Return the number of crossings that are not in the mesh yet."""
     count = 0
     for row in range(tables.counts[EDGES]):
         count += tables.edge_state[row] == PENDING
@@ -94,9 +96,9 @@ def pending(tables):
     return count
 
 
-@njit(cache=True)
+@kernel
 def ring_members(links, tables, edges):
-    """Tetrahedra around some edges that have no parent yet.
+    """Return the tetrahedra around some edges that have no parent yet.
 
     Args:
         links, tables: mesh and stroke.
@@ -118,12 +120,12 @@ def ring_members(links, tables, edges):
                         seen.add(tet)
                         found.append(tet)
             corner = links.corner_next[corner]
-    return np.array(found)
+    return np.array(found, np.int64)
 
 
-@njit(cache=True)
+@kernel
 def adopt(links, tables, members):
-    """Enters tetrahedra in the state table, each as the only child of itself.
+    """Add tetrahedra to the state table, each as the only child of itself.
 
     Args:
         links, tables: mesh and stroke, with room for as many parents.
@@ -143,9 +145,9 @@ def adopt(links, tables, members):
             tables.label[tet, i] = i
 
 
-@njit(cache=True)
+@inner
 def outer_bits(links, tet):
-    """Bit f: the face opposite node f lies on the original surface."""
+    """Return bits of the faces on the original surface; bit f: the face opposite node f."""
     bits = 0
     for face in range(4):
         k = links.face_triangle[tet, face]
@@ -154,18 +156,18 @@ def outer_bits(links, tet):
     return bits
 
 
-@njit(cache=True)
+@kernel
 def outer_bits_of(links, tetrahedra):
-    """The same for several, shape (t,)."""
+    """Return the bits of several tetrahedra, shape (t,)."""
     bits = np.empty(len(tetrahedra), np.uint8)
     for k in range(len(tetrahedra)):
         bits[k] = outer_bits(links, tetrahedra[k])
     return bits
 
 
-@njit(cache=True)
+@kernel
 def parents_concerned(links, tables, edges, nodes):
-    """Rows of the parents that some new crossings belong to, each once."""
+    """Return the rows of the parents of some new crossings, each once."""
     found = [np.int64(0) for _ in range(0)]
     seen = {np.int64(-1)}
     for row in edges:
@@ -185,14 +187,12 @@ def parents_concerned(links, tables, edges, nodes):
                 seen.add(owner)
                 found.append(owner)
             corner = links.corner_next[corner]
-    return np.array(found)
+    return np.array(found, np.int64)
 
 
-@njit(cache=True)
+@inner
 def crossings_of(tables, parent):
-    """Bits of the cut edges and of the nodes on the cut of a parent, as the mesh has them or is
-    to have them.
-    """
+    """Return bits of the cut edges and of the nodes on the cut of a parent, present and new."""
     edges = nodes = 0
     base = tables.parent_nodes[parent]
     for pair in range(6):
@@ -205,9 +205,9 @@ def crossings_of(tables, parent):
     return edges, nodes
 
 
-@njit(cache=True)
+@kernel
 def block(tables, parent, fresh):
-    """Gives up the new crossings of a parent's edges; returns how many."""
+    """Block the new crossings of a parent's edges; return their number."""
     count = 0
     base = tables.parent_nodes[parent]
     for pair in range(6):
@@ -218,7 +218,57 @@ def block(tables, parent, fresh):
     return count
 
 
-@njit(cache=True)
+@inner
+def _all_fresh(tables, node, fresh):
+    """Return whether no edge of a node was cut in an earlier batch."""
+    for row in range(tables.counts[EDGES]):
+        a, b = tables.edge_nodes[row, 0], tables.edge_nodes[row, 1]
+        if tables.edge_state[row] == DONE and node in (a, b) and not (fresh == row).any():
+            return False
+    return True
+
+
+@kernel
+def put_on_cut(tables, parent, fresh, positions):
+    """Put ends of a parent's new crossings on the cut: the parent is too flat to be divided.
+
+    Args:
+        tables: of the stroke; the crossings of such a node wait.
+        parent: row.
+        fresh: rows of the edges that are new in the batch, shape (k,).
+        positions: current nodes [m], shape (n, 3).
+
+    Returns:
+        Rows of these nodes, shape (j,).
+    """
+    found = [np.int64(0) for _ in range(0)]
+    base = tables.parent_nodes[parent]
+    for pair in range(6):
+        edge = find_edge(tables, base[EDGE_NODES[pair, 0]], base[EDGE_NODES[pair, 1]])
+        if edge < 0 or tables.edge_state[edge] != DONE or not (fresh == edge).any():
+            continue
+        share = tables.edge_share[edge]
+        for end in (0, 1) if share <= 0.5 else (1, 0):
+            node = tables.edge_nodes[edge, end]
+            if not _all_fresh(tables, node, fresh):
+                continue
+            row = np.int64(tables.node_row[node])
+            other = tables.edge_nodes[edge, 1 - end]
+            part = share if end == 0 else 1.0 - share
+            for i in range(3):
+                tables.node_plane[row, i] = tables.edge_normal[edge, i]
+                gap = positions[other, i] - positions[node, i]
+                tables.node_plane[row, 3] -= part * gap * tables.edge_normal[edge, i]
+            for k in fresh:
+                if node in (tables.edge_nodes[k, 0], tables.edge_nodes[k, 1]):
+                    tables.edge_state[k] = WAITS_PLUS
+            tables.node_side[row], tables.node_state[row] = SNAPPED, DONE
+            found.append(row)
+            break
+    return np.array(found, np.int64)
+
+
+@inner
 def _forget_child(tables, parent, tet):
     last = tables.child_count[parent] - 1
     for k in range(last + 1):
@@ -228,9 +278,10 @@ def _forget_child(tables, parent, tet):
             return
 
 
-@njit(cache=True)
+@kernel
 def settle(tables, count, removed, owners, labels):
-    """Follows `TetMesh.apply`: tetrahedra go, the last one fills each gap, then new ones come.
+    """Follow `TetMesh.apply`: tetrahedra are removed, the last one fills each gap, new ones are
+    appended.
 
     Args:
         tables: with room for the tetrahedra to come.
@@ -247,7 +298,8 @@ def settle(tables, count, removed, owners, labels):
         owner = tables.owner[count]
         if tet != count:
             tables.owner[tet] = owner
-            tables.label[tet] = tables.label[count]
+            for i in range(4):
+                tables.label[tet, i] = tables.label[count, i]
             if owner >= 0:
                 for k in range(tables.child_count[owner]):
                     if tables.children[owner, k] == count:
@@ -256,22 +308,24 @@ def settle(tables, count, removed, owners, labels):
     for k in range(len(owners)):
         owner = owners[k]
         tables.owner[count] = owner
-        tables.label[count] = labels[k]
+        for i in range(4):
+            tables.label[count, i] = labels[k, i]
         if owner >= 0:
             tables.children[owner, tables.child_count[owner]] = count
             tables.child_count[owner] += 1
         count += 1
 
 
-@njit(cache=True)
+@kernel
 def settle_nodes(tables, count, orphans, copied):
-    """Follows `TetMesh.apply`: nodes come, and the last one takes the number of each that goes.
+    """Follow `TetMesh.apply`: nodes are appended, and the last one gets the number of each removed
+    one.
 
     Args:
         tables: with room for the nodes to come.
         count: nodes before.
-        orphans: nodes that no tetrahedron uses afterwards, largest first, shape (k,).
-        copied: node that each new one is a copy of, or -1, shape (a,).
+        orphans: nodes without a tetrahedron afterwards, largest first, shape (k,).
+        copied: original of each new node, or -1, shape (a,).
     """
     for k in range(len(copied)):
         tables.origin[count + k] = origin_of(tables, copied[k]) if copied[k] >= 0 else -1

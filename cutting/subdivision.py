@@ -1,33 +1,40 @@
-"""New children of the parents that a batch concerns, by the tables of the cases (thesis 5.3.1;
-docs/cutting.md).
-"""
+"""Subdivision: new children of the parents in a batch, by the tables of cases (thesis 5.3.1)."""
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from cutting.cases import CHILDREN, FRONT, INSIDE, LABEL_FACES, MID, NUMBER, ORDER, STATE
-from cutting.geometry import EDGE_NODES, altitude, height
-from cutting.lookup import DONE, PENDING, SNAPPED, edge_key, find_edge, side_of
-from cutting.state_table import crossings_of
-from tissue_sim.topology import FACE_NODES
+from cutting_trainer.cutting.cases import (
+    CHILDREN,
+    FRONT,
+    INSIDE,
+    LABEL_FACES,
+    MID,
+    NUMBER,
+    ORDER,
+    STATE,
+)
+from cutting_trainer.cutting.geometry import EDGE_NODES, altitude, height
+from cutting_trainer.cutting.lookup import DONE, PENDING, SNAPPED, edge_key, find_edge, side_of
+from cutting_trainer.cutting.state_table import crossings_of
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 
 class Pieces(NamedTuple):
-    """What a batch puts in, before nodes are duplicated. New nodes are numbered on from the mesh's
+    """New elements of a batch before nodes are duplicated. New nodes are numbered after the mesh's
     nodes.
 
     Attributes:
         corners: shape (k, 4).
-        labels: the same in terms of the parent, shape (k, 4).
+        labels: corners in terms of the parent, shape (k, 4).
         owners: row of the parent, shape (k,).
         outer: bits of the faces on the original surface, shape (k,).
         states: by parent of the batch, shape (p,).
-        removed: tetrahedra that go, unsorted, shape (r,).
+        removed: removed tetrahedra, unsorted, shape (r,).
         new_parents, new_weights: of the new nodes, shape (v, 4).
-        new_rest: where they are at rest [m], shape (v, 3).
-        orphans: nodes that go, unsorted, shape (o,).
+        new_rest: their rest positions [m], shape (v, 3).
+        orphans: removed nodes, unsorted, shape (o,).
     """
 
     corners: np.ndarray
@@ -42,9 +49,9 @@ class Pieces(NamedTuple):
     orphans: np.ndarray
 
 
-@njit(cache=True)
+@inner
 def id_order(base):
-    """Which of the 24 orders four node numbers are in."""
+    """Return the number of the order, of 24, of four node numbers."""
     rank = np.zeros(4, np.int64)
     for i in range(4):
         for j in range(4):
@@ -52,13 +59,13 @@ def id_order(base):
     return ORDER[rank[0], rank[1], rank[2], rank[3]]
 
 
-@njit(cache=True)
+@inner
 def _front_point(tables, positions, a, b, o, row, tau, centred, weights):
-    """Weights of a, b, o for the end of the slit in their face, where only the edge a b is cut.
+    """Compute weights of a, b, o for the end of the slit in their face, where only edge a b is cut.
 
-    It lies on the line from the crossing of a b to where the surface leaves the face, as far from
-    the face's edges as
-    that line allows: small elements at the front cost stable step for as long as they last.
+    It lies on the line from the crossing of a b to the point where the surface leaves the face, as
+    far from the face's edges as possible: small elements at the front shorten the stable step as
+    long as they last.
     """
     share = tables.edge_share[row] if a < b else 1.0 - tables.edge_share[row]
     if centred:
@@ -73,7 +80,7 @@ def _front_point(tables, positions, a, b, o, row, tau, centred, weights):
     at_o = height(normal, mid, positions[o])
     side = side_of(tables, o)
     with_a = side == side_of(tables, a) if side != 0 else at_o * at_a > 0.0
-    # The surface parts one node from two: the corner, at whose edges it enters and leaves.
+    # The surface separates one node, the corner, from two; it enters and leaves at its edges.
     corner, above, enters = (b, at_b, 1.0 - share) if with_a else (a, at_a, share)
     leaves = above / (above - at_o) if above * at_o < 0.0 else 0.5
     crossing = find_edge(tables, corner, o)
@@ -85,9 +92,9 @@ def _front_point(tables, positions, a, b, o, row, tau, centred, weights):
     weights[1 if with_a else 0] = 1.0 - 2 * far
 
 
-@njit(cache=True)
+@inner
 def _weigh(tables, positions, parent, code, tau, plain, rows, weights):
-    """Parents (as nodes) and weights of the new point that a label stands for."""
+    """Compute parents (as nodes) and weights of the new point of a label."""
     base = tables.parent_nodes[parent]
     for i in range(4):
         rows[i] = base[0]
@@ -100,8 +107,8 @@ def _weigh(tables, positions, parent, code, tau, plain, rows, weights):
         rows[2] = rows[3] = rows[0]
         weights[0], weights[1] = 1.0 - share, share
     elif code == INSIDE:
-        rows[:] = base
-        weights[:] = 0.25
+        for i in range(4):
+            rows[i], weights[i] = base[i], 0.25
     else:
         face = np.sort(base[FACE_NODES[code - FRONT]])
         for k in range(3):
@@ -114,9 +121,9 @@ def _weigh(tables, positions, parent, code, tau, plain, rows, weights):
                 return
 
 
-@njit(cache=True)
+@inner
 def _identity(tables, parent, code):
-    """What parents with this point in common know it by."""
+    """Return the key of a point that is shared by several parents."""
     base = tables.parent_nodes[parent]
     if code < FRONT:
         pair = (code - MID) // 2
@@ -129,16 +136,17 @@ def _identity(tables, parent, code):
     return np.int64(2), edge_key(face[0], face[1]), face[2]
 
 
-@njit(cache=True)
+@kernel
 def subdivide(parents, links, tables, positions, rest, tau, plain):
-    """Children of some parents for the crossings that are DONE.
+    """Return the children of some parents for the crossings that are DONE.
 
     Args:
         parents: rows, shape (p,).
         links, tables: mesh and stroke.
         positions, rest: nodes now and at rest [m], shape (n, 3).
-        tau: points on the front keep away from nodes by this share of an edge; 0.5: face centroids.
-        plain: keys of edges, shape (k,), next to which the front goes through face centroids.
+        tau: smallest distance of points on the front from nodes, as a share of an edge; 0.5: face
+            centroids.
+        plain: keys of edges, shape (k,), next to which the front uses face centroids.
 
     Returns:
         The pieces, and the first parent in an unknown state or -1.
@@ -152,9 +160,9 @@ def subdivide(parents, links, tables, positions, rest, tau, plain):
     new_weights = np.empty((most, 4))
     known = {}
     kept: dict[int, bool] = {}
-    count = 0
+    count = np.int64(0)  # of a literal, Numba would compile `_gathered` once more
     first_new = len(rest)
-    new = 0
+    new = np.int64(0)
     ids = np.empty(INSIDE + 1, np.int64)
     for p in range(len(parents)):
         parent = parents[p]
@@ -173,8 +181,8 @@ def subdivide(parents, links, tables, positions, rest, tau, plain):
                 new_weights,
                 rest,
                 kept,
-                0,
-                0,
+                np.int64(0),
+                np.int64(0),
             ), parent
         ids[:] = -1
         for k in range(tables.child_count[parent]):
@@ -228,9 +236,9 @@ def subdivide(parents, links, tables, positions, rest, tau, plain):
     ), -1
 
 
-@njit(cache=True)
+@inner
 def _outer(label, parent_outer):
-    """Bits of a child's faces that lie in faces of its parent on the original surface."""
+    """Return bits of a child's faces in faces of its parent on the original surface."""
     bits = 0
     for face in range(4):
         common = np.uint8(15)
@@ -242,7 +250,7 @@ def _outer(label, parent_outer):
     return bits
 
 
-@njit(cache=True)
+@inner
 def _gathered(
     corners,
     labels,
@@ -260,7 +268,8 @@ def _gathered(
     new_rest = np.zeros((new, 3))
     for v in range(new):
         for i in range(4):
-            new_rest[v] += new_weights[v, i] * rest[new_parents[v, i]]
+            for axis in range(3):
+                new_rest[v, axis] += new_weights[v, i] * rest[new_parents[v, i], axis]
     orphans = [np.int64(0) for _ in range(0)]
     for node, used in kept.items():
         if not used and node < len(rest):
@@ -271,17 +280,17 @@ def _gathered(
         owners[:count],
         outer[:count],
         states,
-        np.array(removed),
+        np.array(removed, np.int64),
         new_parents[:new],
         new_weights[:new],
         new_rest,
-        np.array(orphans),
+        np.array(orphans, np.int64),
     )
 
 
-@njit(cache=True)
+@kernel
 def spoiled(pieces, tables, rest, moved, where, floor):
-    """Parents with a child below the altitude floor.
+    """Return the parents with a child below the altitude floor.
 
     Args:
         pieces: children of a batch.
@@ -303,14 +312,15 @@ def spoiled(pieces, tables, rest, moved, where, floor):
     for k in range(len(pieces.corners)):
         for i in range(4):
             node = pieces.corners[k, i]
-            if node >= len(rest):
-                x[i] = pieces.new_rest[node - len(rest)]
-            elif node in at:
-                x[i] = where[at[node]]
-            else:
-                x[i] = rest[node]
+            for axis in range(3):
+                if node >= len(rest):
+                    x[i, axis] = pieces.new_rest[node - len(rest), axis]
+                elif node in at:
+                    x[i, axis] = where[at[node], axis]
+                else:
+                    x[i, axis] = rest[node, axis]
         low = altitude(x[0], x[1], x[2], x[3])
         worst = min(worst, low)
         if low < floor and (len(found) == 0 or found[-1] != pieces.owners[k]):
             found.append(pieces.owners[k])
-    return np.array(found), worst
+    return np.array(found, np.int64), worst

@@ -1,17 +1,19 @@
-"""Calls every kernel of cutting once, so that none is compiled or loaded in a stroke."""
+"""Warm-up: calls every kernel of cutting once, so that none is compiled or loaded in a stroke."""
 
 from itertools import pairwise
 
 import numpy as np
 
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from tissue_sim.blade import Sweep
-from tissue_sim.warm_up import small_cube
+from cutting_trainer.cutting.lookup import empty_tables, with_room
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.state_table import block, put_on_cut
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.warm_up import small_cube
 
 
 def warm_up(settings: CuttingSettings) -> None:
-    """Draws a blade through a cube by the method of some settings."""
+    """Move a blade through a cube with the method of some settings."""
     mesh = small_cube()
     method = make_method(settings)
     x = np.array([-0.001, 0.004, 0.007, 0.011])
@@ -21,3 +23,7 @@ def warm_up(settings: CuttingSettings) -> None:
         if not result.delta.empty:
             mesh.apply(result.delta)
     method.finish(mesh, mesh.rest)
+    # Of elements that are too flat to be divided: the cube has none.
+    tables = with_room(empty_tables(), mesh_nodes=1, tetrahedra=1, nodes=1, edges=1, parents=1)
+    put_on_cut(tables, 0, np.zeros(0, np.int64), mesh.rest)
+    block(tables, 0, np.zeros(0, np.int64))

@@ -1,4 +1,4 @@
-"""From the 30 Hz samples of the tissue's force to a force at any time between: thesis 6.3.
+"""Extrapolation of the tissue force from 30 Hz samples to the time of each tick: thesis 6.3.
 
 A sample i is (t_i, P_i, F_i): at time t_i, at tool position P_i, the tissue pushed the tool with
 F_i. Times are those of the device poses that the simulation used, so the delay of the simulation is
@@ -6,7 +6,9 @@ extrapolated over too.
 """
 
 import numpy as np
-from numba import njit
+
+from cutting_trainer.haptic_bridge.proxy.record_type import record_type
+from cutting_trainer.node_common.kernels import inner, kernel
 
 CONSTANT, TIME, POSITION, LOCAL_STIFFNESS = range(4)
 LAWS = {
@@ -16,14 +18,14 @@ LAWS = {
     'local_stiffness': LOCAL_STIFFNESS,
 }
 
-FARTHEST = 3.0
-"""Intervals between samples that a line is followed: one to compute, one to wait, one lost."""
-SHORTEST = 5e-5
-"""[m] Below this distance of two samples their line is encoder noise: the force is held instead."""
-_MOST_CHANGE = 2.0
-"""By which factor the stiffness may change on the way from the newest sample."""
+MAX_EXTRAPOLATION = 3.0
+"""Length of an extrapolation in sample intervals: one to compute, one to wait, one lost."""
+MIN_SAMPLE_DISTANCE_M = 5e-5
+"""[m] Samples closer than this differ by encoder noise only: the force is held instead."""
+_MAX_STIFFNESS_RATIO = 2.0
+"""Factor by which the stiffness may change since the newest sample."""
 
-HISTORY = np.dtype(
+HISTORY = record_type(
     [
         ('count', 'i8'),  # samples that belong together: 0, 1 or 2; index 1 is the newest
         ('time', 'i8', (2,)),  # [ns]
@@ -37,15 +39,16 @@ HISTORY = np.dtype(
 )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def constant(force: np.ndarray, out: np.ndarray) -> None:
-    """F = F_i (eq. 6.3). Forces [N], shape (3,)."""
-    out[:] = force
+    """Hold the newest force: F = F_i (eq. 6.3). Forces [N], shape (3,)."""
+    for k in range(3):
+        out[k] = force[k]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def time_linear(time: int, times: np.ndarray, forces: np.ndarray, out: np.ndarray) -> None:
-    """F = F_i + (t - t_i) / (t_i - t_{i-1}) (F_i - F_{i-1}) (eq. 6.4).
+    """Extrapolate along time: F = F_i + (t - t_i) / (t_i - t_{i-1}) (F_i - F_{i-1}) (eq. 6.4).
 
     Args:
         time: t [ns].
@@ -56,12 +59,12 @@ def time_linear(time: int, times: np.ndarray, forces: np.ndarray, out: np.ndarra
     interval = times[1] - times[0]
     s = 0.0
     if interval > 0:
-        s = min(max((time - times[1]) / interval, 0.0), FARTHEST)
+        s = min(max((time - times[1]) / interval, 0.0), MAX_EXTRAPOLATION)
     for k in range(3):
         out[k] = forces[1, k] + s * (forces[1, k] - forces[0, k])
 
 
-@njit(cache=True, nogil=True)
+@inner
 def position_linear(
     position: np.ndarray,
     positions: np.ndarray,
@@ -69,17 +72,19 @@ def position_linear(
     max_stiffness: float,
     out: np.ndarray,
 ) -> None:
-    """F = F_i + s (F_i - F_{i-1}), s = (P - P_i).(P_i - P_{i-1}) / |P_i - P_{i-1}|^2.
+    """Extrapolate along the last motion: F = F_i + s (F_i - F_{i-1}).
+
+    s = (P - P_i).(P_i - P_{i-1}) / |P_i - P_{i-1}|^2.
 
     Eq. 6.5 with the sign that the printed norms lose: a tool that turns back gets s < 0. Samples
-    closer than `SHORTEST` give no line; s is bounded by `FARTHEST`, the slope by what the device
-    renders.
+    closer than `MIN_SAMPLE_DISTANCE_M` give no line; s is bounded by `MAX_EXTRAPOLATION`, the slope
+    by the stiffness that the device renders.
 
     Args:
         position: P [m], shape (3,).
         positions: P_{i-1}, P_i [m], shape (2, 3).
         forces: F_{i-1}, F_i [N], shape (2, 3).
-        max_stiffness: largest |F_i - F_{i-1}| / |P_i - P_{i-1}| that is believed [N/m].
+        max_stiffness: largest |F_i - F_{i-1}| / |P_i - P_{i-1}| that is accepted [N/m].
         out: F [N], shape (3,).
     """
     squared = along = change = 0.0
@@ -89,8 +94,8 @@ def position_linear(
         along += (position[k] - positions[1, k]) * d
         change += (forces[1, k] - forces[0, k]) ** 2
     s = 0.0
-    if squared >= SHORTEST * SHORTEST:
-        s = min(max(along / squared, -FARTHEST), FARTHEST)
+    if squared >= MIN_SAMPLE_DISTANCE_M * MIN_SAMPLE_DISTANCE_M:
+        s = min(max(along / squared, -MAX_EXTRAPOLATION), MAX_EXTRAPOLATION)
         steepest = max_stiffness * np.sqrt(squared)
         change = np.sqrt(change)
         if change > steepest:
@@ -99,7 +104,7 @@ def position_linear(
         out[k] = forces[1, k] + s * (forces[1, k] - forces[0, k])
 
 
-@njit(cache=True, nogil=True)
+@inner
 def local_stiffness(
     position: np.ndarray,
     at: np.ndarray,
@@ -108,8 +113,9 @@ def local_stiffness(
     max_stiffness: float,
     out: np.ndarray,
 ) -> None:
-    """F = F_i - K (P - P_i), K scaled down where its Frobenius norm exceeds what the device
-    renders.
+    """Extrapolate by a stiffness: F = F_i - K (P - P_i).
+
+    K is scaled down where its Frobenius norm exceeds the stiffness that the device renders.
 
     Args:
         position: P [m], shape (3,).
@@ -128,34 +134,34 @@ def local_stiffness(
         out[k] = force[k] - scale * pull
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def surface_stiffness(stiffness: np.ndarray, largest: float) -> float:
-    """Gives k of a frictionless contact K = k n n^T - n g^T, g along the surface [N/m].
+    """Return k of a frictionless contact K = k n n^T - n g^T, g along the surface [N/m].
 
-    `largest` if it is unknown. The normal may turn on the way, k is taken along.
+    `largest` if it is unknown. The normal may rotate along the path; k stays the same.
     """
     k = stiffness[0, 0] + stiffness[1, 1] + stiffness[2, 2]
     return k if 0.0 < k < largest else largest
 
 
-@njit(cache=True, nogil=True)
-def stiffness_on_way(
+@inner
+def stiffness_along_path(
     stiffness: np.ndarray,
     depth: np.ndarray,
     force: np.ndarray,
-    way: np.ndarray,
+    path: np.ndarray,
     largest: float,
 ) -> float:
-    """Gives k of a contact where the tool has come to [N/m].
+    """Return k of a contact at the new tool position [N/m].
 
     K = k n n^T - (F / k) n (grad k)^T says how k changes along the surface; it is followed to
-    `_MOST_CHANGE` times and through `_MOST_CHANGE`.
+    `_MAX_STIFFNESS_RATIO` times and through `_MAX_STIFFNESS_RATIO`.
 
     Args:
         stiffness: K [N/m], shape (3, 3).
         depth: from the tip to the proxy, along n [m], shape (3,).
         force: [N], shape (3,); F is its part along n.
-        way: of the tip since then [m], shape (3,).
+        path: of the tip since then [m], shape (3,).
         largest: [N/m].
     """
     k = surface_stiffness(stiffness, largest)
@@ -165,15 +171,15 @@ def stiffness_on_way(
         n = depth[i] / size if size > 0.0 else 0.0
         pressed += n * force[i]
         for j in range(3):
-            drop += n * stiffness[i, j] * way[j]
-        drop -= k * n * way[i]
+            drop += n * stiffness[i, j] * path[j]
+        drop -= k * n * path[i]
     if k >= largest or pressed <= 0.0:
         return k
-    change = min(max(1.0 - drop / pressed, 1.0 / _MOST_CHANGE), _MOST_CHANGE)
+    change = min(max(1.0 - drop / pressed, 1.0 / _MAX_STIFFNESS_RATIO), _MAX_STIFFNESS_RATIO)
     return min(k * change, largest)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def local_surface(
     depth: np.ndarray,
     at: np.ndarray,
@@ -182,9 +188,9 @@ def local_surface(
     here: float,
     out: np.ndarray,
 ) -> None:
-    """F = n (F_i . n_i + k |d| - k_i |d_i|): the local stiffness on a surface with edges.
+    """Extrapolate on a surface with edges: F = n (F_i . n_i + k |d| - k_i |d_i|).
 
-    d = |d| n leads from the tip to the proxy on the surface without the tool's dent. On a plane of
+    d = |d| n leads from the tip to the proxy on the undented surface. On a plane of
     even stiffness this is F_i - k n n^T (P - P_i).
 
     Args:
@@ -210,7 +216,7 @@ def local_surface(
         out[k] = max(pressed, 0.0) / deep * depth[k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def estimate(
     law: int,
     history: np.ndarray,
@@ -221,7 +227,7 @@ def estimate(
     max_stiffness: float,
     out: np.ndarray,
 ) -> None:
-    """The force at (time, position) by one of `LAWS`.
+    """Compute the force at (time, position) by one of `LAWS`.
 
     A single sample has no line: TIME holds it, POSITION follows the stiffness there.
 
@@ -238,9 +244,9 @@ def estimate(
     h = history[0]
     local = law == LOCAL_STIFFNESS or (law == POSITION and h.count < 2)
     if local and touching:
-        way = position - h.position[1]
+        path = position - h.position[1]
         k = surface_stiffness(h.stiffness, max_stiffness)
-        here = stiffness_on_way(h.stiffness, h.depth, h.force[1], way, max_stiffness)
+        here = stiffness_along_path(h.stiffness, h.depth, h.force[1], path, max_stiffness)
         local_surface(depth, h.depth, h.force[1], k, here, out)
     elif local:
         local_stiffness(position, h.position[1], h.force[1], h.stiffness, max_stiffness, out)
@@ -253,7 +259,7 @@ def estimate(
 
 
 def clear(history: np.ndarray) -> None:
-    """Forgets the samples; the stiffness stays, as what is last known of this tissue."""
+    """Remove the samples; the stiffness stays, as the last known of this tissue."""
     history['count'] = 0
 
 
@@ -268,7 +274,7 @@ def push(
     topology: int,
     state: int,
 ) -> None:
-    """Adds a sample. A change of connectivity or of the contact's state makes older samples void.
+    """Add a sample. A change of connectivity or of the contact's state removes older samples.
 
     Args:
         history: dtype HISTORY, shape (1,), changed in place.

@@ -1,85 +1,75 @@
-"""One tick of the force loop, from the device's pose to the force on the operator's hand, without
-ROS.
+"""One tick of the force loop, from the device's pose to the force on the operator's hand.
 
-The thesis (ch. 6.2) separates two forces, and so does this: what the proxy's spring exerts loads
-the tissue (`Contact.external_force`); what the tissue answers, extrapolated, is what the hand
-feels.
+This module does not use ROS.
+
+The thesis (ch. 6.2) separates two forces, and so does this module. The force of the proxy's spring
+loads the tissue (`Contact.external_force`). The hand feels the extrapolated reaction of the
+tissue.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from haptic_bridge import chain, extrapolation, safety
-from haptic_bridge.chain import INSIDE, NONE, TOUCHING
-from haptic_bridge.comparators import CONTACTS
-from haptic_bridge.ground import Ground
-from haptic_bridge.operating_state import State
-from haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge import chain, extrapolation, safety
+from cutting_trainer.haptic_bridge.chain import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.contact_values import Tick, contact_values
+from cutting_trainer.haptic_bridge.devices.motion_gate import MotionGate
+from cutting_trainer.haptic_bridge.plausible import MAX_STEP_AHEAD, ContactPlausibility
+from cutting_trainer.haptic_bridge.proxy.friction import make_proxy, split_stiffness
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.undented_surface import UndentedSurface
+from cutting_trainer.haptic_bridge.settings import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
     ToolSettings,
     check_together,
 )
-from haptic_bridge.surface import Surface
-from haptic_bridge.tissue_sample import TissueSample
-from haptic_bridge.wire import Sample
-from tissue_sim.refusals import MessageError, Refusals
+from cutting_trainer.haptic_bridge.tissue_sample import TissueSample
+from cutting_trainer.node_common.cdr_codec import StampedMessage
+from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.node_common.rejections import MessageError, RejectionStatistics
+from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 
 _SECOND = 1e-9
-_LONGEST_STEP = 0.005
-"""[s] of slew that a late tick may catch up on."""
-_UNNOTICED_NS = 3_000_000
-"""[ns] that a sample may lie unread: its age counts from before that, so that deadlines hold."""
-_REMEMBERED = 4096
-"""Contacts of which the answer may still come."""
-ENERGY_CREDIT = 2e-4
-"""[J] that the force loop may have made in all before the passivity controller acts, a fifth of
-what a press of 5 mm on liver stores: below it are encoder steps and errors of extrapolation."""
+_QUEUE_ALLOWANCE_NS = 3_000_000
+"""[ns] of queueing that counts as age of a sample too, so that deadlines hold."""
+_MAX_PENDING_CONTACTS = 4096
+"""Contacts whose answer may still arrive."""
+ENERGY_CREDIT_J = 2e-4
+"""[J] Energy that the force loop may have generated before the passivity controller acts: a fifth
+of the energy of a 5 mm indentation of liver. Encoder steps and extrapolation errors lie below."""
 POSE, FORCE = 'arm/measured_cp', 'tissue/force'
 _INVALID = MessageError('marked invalid', 'its stamp is 0')
 _OUTDATED = MessageError('not newer than the one before')
-_NOWHERE = ([0] * 9, [0.0] * 9, [0.0] * 3, [0.0] * 3)
-
-
-class Tick(NamedTuple):
-    """What one tick commands.
-
-    Attributes:
-        wrench: force [N] and torque [N m] on the hand, as `WrenchStampedCodec` takes them.
-        contact: as `ContactCodec` takes it.
-        contact_stamp_ns: stamp of the device pose that the contact stems from.
-        fault: why force is impossible, '' when nothing is wrong. Whoever calls must enter FAULT.
-    """
-
-    wrench: tuple[float, ...]
-    contact: tuple[float, ...]
-    contact_stamp_ns: int
-    fault: str
+_AHEAD = MessageError('far ahead of the one before')
+_NO_TISSUE = MessageError('a blade in the tissue', 'where the surface is not')
 
 
 class ForcePath:
-    """Proxy, extrapolation and safety chain in the order of one tick.
+    """Computes the force of a tick: proxy, extrapolation and safety chain, in this order.
 
-    Time comes from outside, so that a recorded session gives the same forces again. Ages are
+    Time is an argument, so that a recorded session gives the same forces again. Ages are
     measured between arrivals on the caller's clock; stamps are compared with stamps of the same
     sender only.
 
     Args:
         tool, device, haptics: sections of the scene.
         profile: limits of the device.
-        refusals: to count in; None: its own.
+        refusals: rejection statistics to count in; None: its own.
+        edge_resistance: largest cutting resistance of the tissue by blade length [N/m].
+        friction: of the tool on the tissue.
 
     Attributes:
         stale_trips: how often the simulation's data went stale while enabled.
-        refusals: messages that were refused: repeated, out of order, marked invalid.
+        refusals: statistics of rejected messages: repeated, out of order, marked invalid.
         contact_time: total [s].
         max_force: largest norm commanded [N].
 
     Raises:
-        SettingsError: settings that do not fit together.
+        SettingsError: the settings do not fit together.
     """
 
     def __init__(
@@ -88,13 +78,15 @@ class ForcePath:
         device: DeviceSettings,
         haptics: HapticsSettings,
         profile: DeviceProfile,
-        refusals: Refusals | None = None,
+        rejections: RejectionStatistics | None = None,
+        edge_resistance: float = math.inf,
+        friction: Friction = NO_FRICTION,
     ) -> None:
         check_together(tool, device, haptics, profile)
         self.haptics = haptics
         self._tool, self._device, self._profile = tool, device, profile
         self.stale_trips = 0
-        self.refusals = refusals or Refusals()
+        self.rejections = rejections or RejectionStatistics()
         self.contact_time = 0.0
         self.max_force = 0.0
         self._setup = chain.make_setup(tool, device, haptics, profile)
@@ -104,105 +96,113 @@ class ForcePath:
         self._force, self._wrench, self._tip, self._external, self._blade = map(
             self._s.__getitem__, names
         )
+        self._plausibility = ContactPlausibility(tool, tool.coupling_stiffness)
+        self._max_resistance = edge_resistance * math.dist(tool.blade_root, tool.blade_tip)
         self._history = np.zeros(1, extrapolation.HISTORY)
-        self._proxy = CONTACTS[haptics.contact](tool.radius)
+        self._grips = friction.sliding > 0.0
+        self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
         self._tail = (tool.coupling_stiffness, tool.radius)
         self._pose = np.zeros(7)
+        self._motion = MotionGate()
         self._pose_stamp = self._pose_ns = 0
         self._sample_ns = self._current_ns = self._start_ns = self._last_ns = 0
         self._step = self._sample_revision = -1
         self._sample_state = NONE
-        self._ground = Ground()
+        self._undented = UndentedSurface()
         self._sequence = self._began = self._left = 0
-        self._depths = np.zeros((_REMEMBERED, 3))
+        self._depths = np.zeros((_MAX_PENDING_CONTACTS, 3))
         self._contact = NONE
         self._was_enabled = self._stale = False
 
     def scale_force(self, force_scale: float) -> None:
-        """Changes how much of the tissue's force the hand feels; the slew limit makes it gradual.
+        """Change the scale of the hand's force; the slew limit makes the change gradual.
 
         Args:
             force_scale: hand force over tissue force.
 
         Raises:
             SettingsError: the coupling would be stiffer than the device bears.
-            ValidationError: it is no scale.
+            ValidationError: the scale is out of range.
         """
+        self.haptics = self.check_scale(force_scale)
+        self._setup = chain.make_setup(self._tool, self._device, self.haptics, self._profile)
+
+    def check_scale(self, force_scale: float) -> HapticsSettings:
+        """Return the settings with another scale, or raise as `scale_force`; nothing changes."""
         values = self.haptics.model_dump() | {'force_scale': force_scale}
         haptics = HapticsSettings.model_validate(values)
         check_together(self._tool, self._device, haptics, self._profile)
-        self._setup = chain.make_setup(self._tool, self._device, haptics, self._profile)
-        self.haptics = haptics
+        return haptics
 
     @property
     def force_norm(self) -> float:
-        """Norm of the commanded force [N]."""
+        """Return the norm of the commanded force [N]."""
         return math.hypot(*self._force.tolist())
 
     @property
     def is_stale(self) -> bool:
-        """Whether the simulation is silent while force is wanted."""
+        """Return whether the simulation is silent while force is wanted."""
         return self._stale
 
     @property
     def contact(self) -> int:
-        """NONE, TOUCHING or INSIDE."""
+        """Return NONE, TOUCHING or INSIDE."""
         return self._contact
 
     @property
     def energy(self) -> float:
-        """What the hand has put in, net [J]; negative: the force loop has made energy."""
-        return float(self._s['energy']) - ENERGY_CREDIT
+        """Return the net energy that the hand has put in [J]; negative: the loop made energy."""
+        return float(self._s['energy']) - ENERGY_CREDIT_J
 
     @property
     def damping(self) -> float:
-        """Of the passivity controller now [N s/m]."""
+        """Return the damping of the passivity controller now [N s/m]."""
         return float(self._s['damping'])
 
     def pose_age(self, now_ns: int) -> float:
-        """Since the last believable device pose [s]; infinite before the first."""
+        """Return the time since the last plausible device pose [s]; infinite before the first."""
         return (now_ns - self._pose_ns) * _SECOND if self._pose_ns else np.inf
 
     def simulation_age(self, now_ns: int) -> float:
-        """Since the last force and surface of the simulation [s]; infinite before the first."""
+        """Return the time since the last force and surface [s]; infinite before the first."""
         oldest = min(self._sample_ns, self._current_ns)
         return (now_ns - oldest) * _SECOND if oldest else np.inf
 
     def cause(self, now_ns: int) -> str:
-        """Why the device cannot be given force now; '' when nothing is wrong."""
+        """Return why no force may be commanded now; '' when nothing is wrong."""
         if self.pose_age(now_ns) > self.haptics.device_timeout:
             return f'no valid device pose for {self.haptics.device_timeout * 1e3:g} ms'
         return ''
 
     def is_fresh(self, now_ns: int) -> bool:
-        """Whether device, force and surface have all arrived lately."""
+        """Return whether device, force and surface have all arrived lately."""
         return not self.cause(now_ns) and self.simulation_age(now_ns) <= self.haptics.stale_after
 
     def tick(
         self,
         now_ns: int,
         *,
-        state: State,
-        pose: Sample | None = None,
-        sample: Sample | None = None,
+        state: CrtkState,
+        pose: StampedMessage | None = None,
+        sample: StampedMessage | None = None,
         sample_ns: int | None = None,
         surface: Surface | None = None,
     ) -> Tick:
-        """One period.
+        """Compute one period.
 
         Args:
             now_ns: monotonic clock [ns].
             state: operating state; force only when ENABLED, zero at once when FAULT.
             pose: `measured_cp` where one has arrived since the last tick.
             sample: `ForceSample` where one has arrived since the last tick.
-            sample_ns: from when its age counts [ns] where it waited in a queue; None: `now_ns`.
+            sample_ns: arrival time of the sample [ns] if it waited in a queue; None: `now_ns`.
             surface: the newest surface of the tissue; None before the first.
         """
-        elapsed = min(max((now_ns - self._last_ns) * _SECOND, 1e-4), _LONGEST_STEP)
+        elapsed = min(max((now_ns - self._last_ns) * _SECOND, 1e-4), chain.MAX_SLEW_PERIOD_S)
         self._last_ns = now_ns
-        enabled = state is State.ENABLED
+        enabled = state is CrtkState.ENABLED
         fault = self._take_pose(now_ns, pose, enabled) or self._take_sample(
-            now_ns, sample, now_ns if sample_ns is None else sample_ns
+            now_ns, sample, now_ns if sample_ns is None else sample_ns, surface
         )
         fault = fault or self.cause(now_ns)
         enabled, fault = enabled and not fault, fault if enabled else ''
@@ -211,7 +211,7 @@ class ForcePath:
         self._was_enabled = enabled
         gain = self._gain(now_ns, enabled)
         touched = self._touch(now_ns, surface, enabled)
-        if fault or state is State.FAULT:
+        if fault or state is CrtkState.FAULT:
             self._s['force'] = 0.0
         if not chain.command(
             self._setup,
@@ -228,22 +228,31 @@ class ForcePath:
             self.contact_time += elapsed
         self.max_force = max(self.max_force, self.force_norm)
         wrench = (*self._wrench.tolist(), 0.0, 0.0, 0.0)
-        return Tick(wrench, self._contact_values(surface, touched), self._pose_stamp, fault)
+        contact = contact_values(
+            self._sequence,
+            self._contact,
+            surface,
+            touched,
+            (self._tip, self._external, self._blade),
+            self._tail,
+        )
+        return Tick(wrench, contact, self._pose_stamp, fault)
 
-    def _take_pose(self, now_ns: int, pose: Sample | None, enabled: bool) -> str:
+    def _take_pose(self, now_ns: int, pose: StampedMessage | None, enabled: bool) -> str:
         if pose is None:
             return ''
-        # After a silence without force anything is a new start: a device may have another clock.
+        # After a silence without force, motion starts anew: the device may have another clock.
         known = enabled or self.pose_age(now_ns) <= self.haptics.device_timeout
         if pose.stamp_ns == 0 or (known and pose.stamp_ns <= self._pose_stamp):
-            self.refusals.add(POSE, _OUTDATED if pose.stamp_ns else _INVALID)
+            self.rejections.add(POSE, _OUTDATED if pose.stamp_ns else _INVALID)
             return ''
         known = known and enabled
-        elapsed = (pose.stamp_ns - self._pose_stamp) * _SECOND if known else np.inf
         self._pose[:] = pose.values
-        code = safety.pose_gate(self._pose[:3], self._pose[3:], self._s['device'], elapsed)
+        code = safety.pose_gate(self._pose[:3], self._pose[3:]) or (
+            self._motion.judge(self._pose, pose.stamp_ns, known=known)
+        )
         if code != safety.OK:
-            self.refusals.add(POSE, MessageError(safety.POSE_FAULTS[code]))
+            self.rejections.add(POSE, MessageError(safety.POSE_FAULTS[code]))
             return safety.POSE_FAULTS[code]
         chain.to_tissue(self._setup, self._state, self._pose)
         if not known:
@@ -251,49 +260,71 @@ class ForcePath:
         self._pose_stamp, self._pose_ns = pose.stamp_ns, now_ns
         return ''
 
-    def _take_sample(self, now_ns: int, sample: Sample | None, sample_ns: int) -> str:
+    def _take_sample(
+        self, now_ns: int, sample: StampedMessage | None, sample_ns: int, surface: Surface | None
+    ) -> str:
         if sample is None:
             return ''
-        said = TissueSample.read(sample)
+        reaction = TissueSample.read(sample)
         fresh = (now_ns - self._sample_ns) * _SECOND <= self.haptics.stale_after
-        if sample.stamp_ns == 0 or (fresh and said.step <= self._step):
-            self.refusals.add(FORCE, _OUTDATED if sample.stamp_ns else _INVALID)
+        if sample.stamp_ns == 0 or (fresh and reaction.step <= self._step):
+            self.rejections.add(FORCE, _OUTDATED if sample.stamp_ns else _INVALID)
             return ''
-        if problem := said.problem:
-            self.refusals.add(FORCE, problem)
+        if problem := reaction.problem:
+            self.rejections.add(FORCE, problem)
             extrapolation.clear(self._history)
             return str(problem)
+        if fresh and reaction.step > self._step + MAX_STEP_AHEAD:
+            self.rejections.add(FORCE, _AHEAD)
+            return ''
+        if reaction.state == INSIDE and not self._accepts_inside(now_ns, surface):
+            self.rejections.add(FORCE, _NO_TISSUE)
+            return ''
         if not fresh:
             extrapolation.clear(self._history)
-        self._step, self._sample_revision = said.step, said.revision
-        self._sample_ns = sample_ns - _UNNOTICED_NS
-        self._sample_state = said.state
-        self._s['resistance'] = said.resistance
-        answered = self._began <= said.sequence <= self._sequence and self._contact == TOUCHING
-        if said.state == INSIDE or answered:
-            there = self._depths[said.sequence % _REMEMBERED]
+        if self._grips and reaction.state != INSIDE and reaction.stiffness.any():
+            pressing, beside = split_stiffness(reaction.stiffness, self._proxy.touch.normal)
+            reaction = reaction._replace(stiffness=pressing)
+            self._s['stick']['stiffness'] = beside
+        self._step, self._sample_revision = reaction.step, reaction.revision
+        self._sample_ns = sample_ns - _QUEUE_ALLOWANCE_NS
+        self._sample_state = reaction.state
+        self._s['resistance'] = min(reaction.resistance, self._max_resistance)
+        if reaction.state == INSIDE:
+            slack = float(self._setup['slack'][0])
+            self._s['held'] = min(self._s['held'], math.hypot(*reaction.force) + slack)
+        elif reaction.stiffness.any():
+            reported = extrapolation.surface_stiffness(reaction.stiffness, self._tail[0])
+            self._plausibility.update_stiffness(self._state, now_ns, reported)
+        answered = self._began <= reaction.sequence <= self._sequence and self._contact == TOUCHING
+        if reaction.state == INSIDE or answered:
+            there = self._depths[reaction.sequence % _MAX_PENDING_CONTACTS]
             extrapolation.push(
                 self._history,
-                said.time,
-                said.position,
-                said.force,
-                said.stiffness,
+                reaction.time,
+                reaction.position,
+                reaction.force,
+                reaction.stiffness,
                 there,
-                topology=said.topology,
-                state=said.state,
+                topology=reaction.topology,
+                state=reaction.state,
             )
-        elif said.sequence > self._left and not self._history['count'][0]:
-            # What the tissue says of a place that the tool comes near to, or has touched since.
-            if said.stiffness.any():
-                self._history['stiffness'] = said.stiffness
-            if said.state == NONE and self._contact == NONE:
-                self._ground.answered_free(now_ns, said.revision)
+        elif reaction.sequence > self._left and not self._history['count'][0]:
+            # The reported state is of a place that the tool approaches, or has touched since.
+            if reaction.stiffness.any():
+                self._history['stiffness'] = reaction.stiffness
+            if reaction.state == NONE and self._contact == NONE:
+                self._undented.note_free(now_ns, reaction.revision)
         return ''
+
+    def _accepts_inside(self, now_ns: int, surface: Surface | None) -> bool:
+        already = self._contact == INSIDE
+        return self._plausibility.accepts(now_ns, surface, self._blade, already=already)
 
     def _begin(self, now_ns: int) -> None:
         self._start_ns = now_ns
         self._stale = False
-        self._s['energy'] = ENERGY_CREDIT
+        self._s['energy'] = ENERGY_CREDIT_J
         self._s['velocity'] = 0.0
         self._leave_contact()
 
@@ -317,17 +348,21 @@ class ForcePath:
         )
 
     def _touch(self, now_ns: int, surface: Surface | None, enabled: bool) -> Any:
-        """Moves the proxy; returns what it touches or comes near to, None where it has no say."""
+        """Move the proxy; return its contact or nearest triangle, None while it is unused."""
         self._sequence += 1
         self._follow(now_ns, surface)
         before = self._contact
-        inside = self._sample_state == INSIDE
-        if enabled and inside:
+        inside = enabled and self._sample_state == INSIDE and self._accepts_inside(now_ns, surface)
+        if inside:
             # The samples of the cut stay: the change of state has already voided the older ones.
             if before != INSIDE:
                 self._proxy.reset()
-                self._ground.release()
+                self._undented.release()
+                before_cut = self.force_norm / self.haptics.force_scale
+                self._s['held'] = before_cut + self._setup['slack'][0]
             self._contact = INSIDE
+            assert surface is not None
+            self._s['reach'] = self._plausibility.reach(surface, self._blade)
             self._s['proxy'] = self._tip
             return None
         if before == INSIDE or (before == TOUCHING and not enabled):
@@ -336,12 +371,12 @@ class ForcePath:
         if not enabled or surface is None:
             self._s['proxy'] = self._tip
             return None
-        ground = self._ground.surface
+        ground = self._undented.surface
         assert ground is not None
-        touched = self._proxy.step(ground, self._ground.blend(now_ns), self._tip)
-        self._s['proxy'] = touched.position
-        slot = self._sequence % _REMEMBERED
-        self._depths[slot] = touched.position - self._tip
+        touched = self._proxy.step(ground, self._undented.blend(now_ns), self._tip)
+        self._s['proxy'] = self._proxy.place
+        slot = self._sequence % _MAX_PENDING_CONTACTS
+        self._depths[slot] = self._proxy.place - self._tip
         self._contact = TOUCHING if touched.touching else NONE
         if self._contact != before:
             extrapolation.clear(self._history)
@@ -349,46 +384,18 @@ class ForcePath:
             if before == TOUCHING:
                 self._left = self._sequence
             return touched
-        self._ground.press()
+        self._undented.freeze()
+        self._plausibility.note_touch(now_ns)
         if before != TOUCHING:
             self._began = self._sequence
-            # What the last contact dissipated is no credit for this one, what it made is a debt.
-            self._s['energy'] = min(self._s['energy'], ENERGY_CREDIT)
+            # Energy that the last contact dissipated is no credit; energy that it made is a debt.
+            self._s['energy'] = min(self._s['energy'], ENERGY_CREDIT_J)
         self._s['normal'] = touched.normal
         return touched
 
     def _follow(self, now_ns: int, surface: Surface | None) -> None:
         if surface is None:
             return
-        self._ground.follow(now_ns, surface)
+        self._undented.follow(now_ns, surface)
         if surface.revision >= self._sample_revision:
             self._current_ns = now_ns
-
-    def _contact_values(self, surface: Surface | None, touched: Any) -> tuple[float, ...]:
-        # Lists: for three numbers an operation of numpy takes ten times as long.
-        stiffness, radius = self._tail
-        tip, external = self._tip.tolist(), self._external.tolist()
-        proxy = [t - e / stiffness for t, e in zip(tip, external, strict=True)]
-        revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
-        nodes, weights, point, normal = _NOWHERE
-        if touched is not None:
-            nodes = [max(node, 0) for node in touched.nodes.tolist()]
-            weights, normal = touched.weights.tolist(), touched.normal.tolist()
-            contact, position = touched.contact.tolist(), touched.position.tolist()
-            point = [p + (c - q) for p, c, q in zip(proxy, contact, position, strict=True)]
-        return (
-            self._sequence,
-            self._contact,
-            revision,
-            topology,
-            *nodes,
-            *weights,
-            *tip,
-            *proxy,
-            *point,
-            *normal,
-            *external,
-            stiffness,
-            *self._blade.ravel().tolist(),
-            radius,
-        )

@@ -1,170 +1,104 @@
-"""Node `haptic_bridge`: poses in, forces out, a thousand times a second."""
+"""Node `haptic_bridge`: subscribes to device poses and tissue forces, commands forces at 1 kHz."""
 
+import math
 import threading
 import time
-from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-from cutting_trainer_msgs.msg import Contact, ForceSample
+from cutting_trainer_msgs.msg import Contact
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import SetParametersResult
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
 from rclpy.parameter import Parameter
 
-from haptic_bridge.convention import DeviceConvention
-from haptic_bridge.crtk import DeviceState, HoldButton, StateInterface
-from haptic_bridge.force_path import ForcePath
-from haptic_bridge.operating_state import OperatingStateMachine, State
-from haptic_bridge.realtime import prepare, run_real_time
-from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
-from haptic_bridge.stream_watch import StreamWatch
-from haptic_bridge.surface import Surface
-from haptic_bridge.warm_up import warm_up
-from haptic_bridge.wire import (
+from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
+from cutting_trainer.haptic_bridge.devices.wiring import Wiring
+from cutting_trainer.haptic_bridge.e_stop import EStop, Listener
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.haptic_bridge.simulation_follower import SimulationFollower
+from cutting_trainer.haptic_bridge.warm_up import warm_up
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
-    ForceSampleCodec,
     PoseStampedCodec,
-    Sample,
+    StampedMessage,
     WireError,
     WrenchStampedCodec,
 )
-from tissue_sim import ros
-from tissue_sim.lifecycle import ManagedNode, Stop, announce_ready, run
-from tissue_sim.mesh_follower import MeshFollower
-from tissue_sim.parameters import parameter, scene_parameter, seed_parameter
-from tissue_sim.refusals import require_frame
-from tissue_sim.scene_file import read_section
-from tissue_sim.timing import Durations, PeriodicLoop
+from cutting_trainer.node_common.crtk import DeviceState, HoldButton, StateInterface
+from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
+from cutting_trainer.node_common.operating_state import (
+    AutoEnable,
+    CrtkState,
+    OperatingStateMachine,
+    crtk_types,
+)
+from cutting_trainer.node_common.parameters import parameter, scene_parameter, seed_parameter
+from cutting_trainer.node_common.publishers import PublisherMonitor
+from cutting_trainer.node_common.realtime import prepare, run_real_time
+from cutting_trainer.node_common.scene_file import read_section
+from cutting_trainer.node_common.stream_monitor import StreamMonitor
+from cutting_trainer.node_common.timing import Durations, PeriodicLoop
+from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
+from cutting_trainer.tissue_sim.settings import TissueSettings
 
-FOLLOW_PERIOD = 0.003
-"""[s] between two looks for meshes of the simulation."""
-STATE_PERIOD = 0.02
-"""[s] between two looks for changes of the operating state, while the bridge works."""
-CLOCK_STEP = 1_000_000
+MESH_POLL_PERIOD_S = 0.003
+"""[s] between two polls for meshes of the simulation."""
+STATE_POLL_PERIOD_S = 0.02
+"""[s] between two polls of the operating state, while the bridge works."""
+GRAPH_CHECK_PERIOD_S = 0.25
+"""[s] between two checks of the graph for a subscriber of the force, while force is on."""
+WATCHED = (f'{ros.ARM}/measured_cp', ros.FORCE, ros.MESH, ros.MESH_UPDATES)
+"""Topics that move the hand; each may have one publisher."""
+CLOCK_STEP_NS = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
 
-class SimulationFollower:
-    """Keeps up with the simulation: its forces in the fast loop; its meshes in a thread beside it,
-    so that decoding one delays no force.
-
-    Args:
-        node: to subscribe with.
-        on_error: told, as a sentence, that a message could not be used.
-
-    Attributes:
-        surface: the newest whole one; None before the first.
-    """
-
-    def __init__(self, node: ManagedNode, on_error: Callable[[str], None]) -> None:
-        self.surface: Surface | None = None
-        self._on_error = on_error
-        self._refusals = node.refusals
-        self._follower = MeshFollower(node, node.refusals)
-        self._codec = ForceSampleCodec()
-        self._watch = StreamWatch(ros.FORCE, queues=True)
-        self._late = 0
-        self._force = ros.polled(node, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
-
-    @property
-    def report(self) -> dict[str, object]:
-        """What /diagnostics says of the simulation's messages; of the mesh see `MeshFollower`."""
-        revision, known = self._follower.checked
-        return {
-            'late_forces': self._late,
-            'revision_gaps': self._follower.gaps,
-            'mesh_checked_revision': revision,
-            'mesh_checked_hash': f'{known:016x}',
-            'mesh_mismatches': self._follower.mismatches,
-            'stale_meshes': self._follower.stale,
-        }
-
-    def cause(self, now_ns: int) -> str:
-        """Why the simulation's forces cannot be trusted at this time [ns], '' if they can."""
-        return self._watch.cause(now_ns)
-
-    def take_force(self, now_ns: int) -> tuple[Sample | None, int]:
-        """The next force, and since when [ns] it would have been here had it not waited anywhere:
-        so old is it, however late it is read.
-
-        Args:
-            now_ns: monotonic clock [ns].
-        """
-        try:
-            taken = ros.take_numbered(self._force)
-            if taken is None:
-                return None, now_ns
-            sample = self._codec.decode(taken[0])
-            require_frame(ros.FORCE, sample.frame_id)
-            problem = self._watch.see(taken[1], sample.stamp_ns, now_ns)
-        except Exception as error:
-            self._refuse(ros.FORCE, error)
-            return None, now_ns
-        if problem:
-            self._on_error(problem)
-        if self._watch.late:
-            self._late += 1
-            return None, now_ns
-        return sample, now_ns - self._watch.delay
-
-    def follow_mesh(self) -> None:
-        """Takes what has come of the mesh."""
-        try:
-            self._take_surface()
-        except Exception as error:
-            self._refuse(ros.MESH, error)
-            self._follower.ask()
-
-    def _refuse(self, topic: str, error: Exception) -> None:
-        self._refusals.add(topic, error)
-        self._on_error(f'message of the simulation: {error}')
-
-    def _take_surface(self) -> None:
-        if self._follower.poll():
-            self._renew()
-        if self._follower.problem:
-            self._on_error(f'message of the simulation: {self._follower.problem}')
-
-    def _renew(self) -> None:
-        replica = self._follower.replica
-        self.surface = Surface(
-            replica.positions(),
-            replica.triangles,
-            revision=replica.revision,
-            topology=replica.topology,
-            previous=self.surface,
-        )
-
-
 class HapticBridge(ManagedNode):
-    """The shell of `ForcePath`.
+    """ROS interface of `ForcePath`.
 
     Parameters:
         scene: path of the scene file.
         auto_enable: enter ENABLED when device, force and surface are fresh for the first time.
-            Never again after that: a FAULT is left by a command only.
+            Never again after that: a FAULT is left by a command only. Never after an E-STOP.
+        e_stop_pressed: E-STOP is pressed from the start, as it was when this node died.
         force_scale: hand force over tissue force; may be set while the node runs.
+        accepted_publishers: see `accepted_publishers`.
     """
 
     def __init__(self) -> None:
         super().__init__('haptic_bridge')
+        text = 'E-STOP is pressed from the start: for a node that replaces a stopped one'
+        pressed = bool(parameter(self, 'e_stop_pressed', False, text))
+        self._machine = OperatingStateMachine(self._cause, pressed=pressed)
+        self._e_stop: EStop | None = None
+        Listener(self)
 
     def configure(self) -> None:
-        """Reads the scene, compiles the force path, makes the topics."""
+        """Read the scene, compile the force path, create the topics."""
         scene = Path(scene_parameter(self))
         seed_parameter(self)
         text = 'enter ENABLED, once, when device, force and surface are fresh'
-        self._auto_enable = bool(parameter(self, 'auto_enable', False, text))
+        wanted = bool(parameter(self, 'auto_enable', False, text))
         device = read_section(scene, 'device', DeviceSettings)
         tool = read_section(scene, 'tool', ToolSettings)
         haptics = read_section(scene, 'haptics', HapticsSettings)
         profile = device.load_profile()
-        warm_up(tool, device, haptics, profile)
-        self._path = ForcePath(tool, device, haptics, profile, self.refusals)
-        self._machine = OperatingStateMachine(self._cause)
+        resistance, friction = of_tissue(scene)
+        warm_up(tool, device, haptics, profile, friction)
+        self._path = ForcePath(
+            tool, device, haptics, profile, self.rejections, resistance, friction
+        )
+        self._machine.start_anew()
+        self._auto_enable = AutoEnable(self._machine, wanted=wanted)
         self._convention = DeviceConvention(device)
-        self._watch = StreamWatch(f'{ros.ARM}/measured_cp')
+        self._watch = StreamMonitor(f'{ros.ARM}/measured_cp')
         self._loop = PeriodicLoop(haptics.rate)
         self._latency = Durations('pose_to_force')
         self._real_time = 'the force loop has not started'
@@ -173,21 +107,38 @@ class HapticBridge(ManagedNode):
         self._wrench_codec = WrenchStampedCodec(f'{ros.ARM}_base')
         self._contact_codec = ContactCodec(ros.FRAME)
         self._pose = ros.polled(self, PoseStamped, f'{ros.ARM}/measured_cp', ros.NEWEST_BEST_EFFORT)
-        self._wrench = self.create_publisher(WrenchStamped, f'{ros.ARM}/servo_cf', ros.STREAM)
+        self._wrench = self.create_publisher(
+            WrenchStamped, f'{ros.ARM}/{device.force_topic}', ros.STREAM
+        )
         self._contact = self.create_publisher(Contact, ros.CONTACT, ros.STREAM)
+        self._senders = PublisherMonitor(self, WATCHED, accepted_publishers(self, device))
         self._follower = SimulationFollower(self, self._machine.fault)
         self._interface = StateInterface(self, 'haptic_bridge', self._machine)
         self._device = DeviceState(self, ros.ARM, self._machine)
         self._button = HoldButton(self, ros.ARM, self._machine) if device.hold_button else None
+        stop_button = -1 if device.e_stop_button is None else device.e_stop_button
+        self._e_stop = EStop(self, self._machine, stop_button)
+        types = crtk_types()
+        understood = {
+            f'{ros.ARM}/operating_state': types.operating_state,
+            'haptic_bridge/state_command': types.command,
+        }
+        self._wiring, self._wiring_due = Wiring(self, self._wrench, understood), 0.0
         text = 'hand force over tissue force [-], above 0 to 100'
         parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
-        self.add_on_set_parameters_callback(self._set_parameters)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._use_parameters)
         self._epoch = time.time_ns() - time.monotonic_ns()
         self._stale_trips = 0
         self._diagnostics = ros.Diagnostics(self, self._collect)
 
+    @property
+    def progress(self) -> int:
+        """Return the number of loop iterations."""
+        return self._loop.ticks
+
     def work(self, stop: Stop) -> None:
-        """Runs the force loop in the calling thread until `stop` is set."""
+        """Run the force loop in the calling thread until `stop` is set."""
         beside = threading.Thread(target=self._work_beside, args=(stop,), daemon=True)
         beside.start()
         announce_ready(self)
@@ -197,55 +148,80 @@ class HapticBridge(ManagedNode):
         beside.join(1.0)
 
     def _work_beside(self, stop: Stop) -> None:
-        """What a late tick must not wait for. No timer: each turn of rclpy's executor costs more
-        than a tick.
+        """Do the work that must not delay a tick, in a thread of its own.
+
+        There is no timer: each iteration of rclpy's executor costs more than a tick.
         """
         due = 0.0
         while not stop.is_set():
             self._follower.follow_mesh()
             now = time.monotonic()
             if now >= due:
-                due = now + STATE_PERIOD
+                due = now + STATE_POLL_PERIOD_S
                 try:
                     self._watch_state()
-                except Exception as error:  # nobody else would say it, nor follow the mesh
+                except Exception as error:  # nothing else reports it, nor follows the mesh
                     self._machine.fault(f'the state watch failed: {type(error).__name__}: {error}')
-            time.sleep(FOLLOW_PERIOD)
+            time.sleep(MESH_POLL_PERIOD_S)
 
     def rest(self) -> None:
-        """Leaves no force behind, and none when it works again: that takes a command."""
-        self._auto_enable = False
-        if self._machine.state is not State.FAULT:
+        """Set the force to zero; after the next activation force takes a command."""
+        self._auto_enable.forgo()
+        if self._machine.state is not CrtkState.FAULT:
             self._machine.command('disable')
         self._interface.publish_changes()
         self._send((0.0,) * 6, time.monotonic_ns())
         self._wrench.wait_for_all_acked(Duration(seconds=0.2))
 
     def release(self) -> None:
-        """Publishes the last totals."""
-        self.remove_on_set_parameters_callback(self._set_parameters)
+        """Publish the last totals."""
+        self.remove_on_set_parameters_callback(self._check_parameters)
+        self.remove_post_set_parameters_callback(self._use_parameters)
         self._diagnostics.publish()
+        self._e_stop = None
 
-    def _set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+    def press_e_stop(self) -> None:
+        """Press E-STOP, on request of the launcher."""
+        self._machine.press()
+        if (e_stop := self._e_stop) is not None:  # a cleanup in another thread sets it to None
+            e_stop.confirm()
+
+    def poll_e_stop(self) -> None:
+        """Poll E-STOP while no tick does, and publish a change; called from a thread."""
+        e_stop = self._e_stop  # a cleanup in another thread sets it to None
+        if not self.is_active and e_stop is not None:
+            with suppress(InvalidHandle, RCLError):  # the node is being cleaned up
+                e_stop.poll(time.time_ns())
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Reject a request with any invalid parameter: all of it is used, or nothing."""
         for given in parameters:
             if given.name != 'force_scale':
-                reason = f'{given.name} is read once, at the start of the node'
+                reason = f'{given.name} is read only at the start of the node'
                 return SetParametersResult(successful=False, reason=reason)
             try:
-                self._path.scale_force(given.value)
+                self._path.check_scale(given.value)
             except ValueError as error:
                 reason = ' '.join(str(error).split())
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
+    def _use_parameters(self, parameters: list[Parameter]) -> None:
+        for given in parameters:
+            if given.name == 'force_scale':
+                self._path.scale_force(given.value)
+
     def _cause(self) -> str:
         now = time.monotonic_ns()
         streams = self._watch.cause(now) or self._follower.cause(now)
-        return streams or self._device.cause or self._path.cause(now)
+        streams = streams or self._senders.cause
+        return streams or self._device.cause or self._path.cause(now) or self._wiring.cause()
 
     def _tick(self, _late: int) -> None:
         now = time.monotonic_ns()
         try:
+            assert self._e_stop is not None
+            self._e_stop.poll(self._epoch + now)
             pose = self._take_pose(now)
             sample, sample_ns = self._follower.take_force(now)
             tick = self._path.tick(
@@ -267,40 +243,40 @@ class HapticBridge(ManagedNode):
             self._machine.fault(f'the force loop failed: {type(error).__name__}: {error}')
             self._send((0.0,) * 6, now)
 
-    def _take_pose(self, now: int) -> Sample | None:
+    def _take_pose(self, now: int) -> StampedMessage | None:
         taken = ros.take_numbered(self._pose)
         if taken is None:
             return None
         try:
             sample = self._pose_codec.decode(taken[0])
         except WireError as error:
-            self.refusals.add(f'{ros.ARM}/measured_cp', error)
+            self.rejections.add(f'{ros.ARM}/measured_cp', error)
             raise
         problem = self._watch.see(taken[1], sample.stamp_ns, now, sample.frame_id)
-        if problem and self._machine.state is State.ENABLED:
+        if problem and self._machine.state is CrtkState.ENABLED:
             self._machine.fault(problem)
         return self._convention.pose(sample)
 
     def _send(self, wrench: tuple[float, ...], now: int) -> None:
-        """Publishes a force, stamped with the time [ns] for which it was computed."""
+        """Publish a force, stamped with the time [ns] at which it was computed."""
         wrench = self._convention.force(wrench)
         self._wrench.publish(self._wrench_codec.encode(self._epoch + now, wrench))
 
     def _watch_state(self) -> None:
-        # The largest: where the thread lost its turn between the two readings, it is too small.
+        # The largest: a thread preempted between the two readings gives too small a value.
         epoch = max(time.time_ns() - time.monotonic_ns() for _ in range(3))
-        if abs(epoch - self._epoch) > CLOCK_STEP:
+        if abs(epoch - self._epoch) > CLOCK_STEP_NS:
             self._epoch = epoch
+        if stranger := self._senders.look(time.monotonic()):
+            self._machine.fault(stranger)
         if self._button is not None:
             self._button.enforce()
-        if (
-            self._auto_enable
-            and not self._machine.is_stopped
-            and not self._device.cause
-            and self._path.is_fresh(time.monotonic_ns())
-        ):
-            self._auto_enable = False
-            self._machine.command('enable')
+        self._auto_enable.look(self._can_begin)
+        now = time.monotonic()
+        if self._machine.state is CrtkState.ENABLED and now >= self._wiring_due:
+            self._wiring_due = now + GRAPH_CHECK_PERIOD_S
+            if cause := self._wiring.cause():
+                self._machine.fault(cause)
         reason = self._machine.reason
         if reason and not self._was_faulty:
             self._faults += 1
@@ -315,6 +291,13 @@ class HapticBridge(ManagedNode):
             )
         self._interface.publish_changes()
 
+    def _can_begin(self) -> bool:
+        return (
+            not (self._device.cause or self._senders.cause)
+            and self._path.is_fresh(time.monotonic_ns())
+            and not self._wiring.cause()
+        )
+
     def _collect(self) -> tuple[bytes, str, dict[str, object]]:
         now = time.monotonic_ns()
         path, machine, report = self._path, self._machine, self._loop.report()
@@ -322,6 +305,7 @@ class HapticBridge(ManagedNode):
         publishers = self.count_publishers(self._pose.topic_name)
         values: dict[str, object] = {
             'operating_state': machine.state,
+            'e_stop': 'pressed' if machine.e_stopped else 'released',
             'device_state': self._device.state,
             'fault': machine.reason,
             'faults': self._faults,
@@ -332,6 +316,7 @@ class HapticBridge(ManagedNode):
             'max_force': path.max_force,
             'pose_age': path.pose_age(now),
             'pose_publishers': publishers,
+            'stranger': self._senders.cause,
             'simulation_age': path.simulation_age(now),
             'stale_trips': path.stale_trips,
             'force_scale': path.haptics.force_scale,
@@ -345,9 +330,9 @@ class HapticBridge(ManagedNode):
             **self._latency.report(),
             **report,
         }
-        if machine.state is State.FAULT:
+        if machine.state is CrtkState.FAULT:
             return DiagnosticStatus.ERROR, machine.reason, values
-        if machine.state is State.ENABLED and path.is_stale:
+        if machine.state is CrtkState.ENABLED and path.is_stale:
             return DiagnosticStatus.WARN, 'the simulation is silent: no force', values
         if publishers > 1:
             topic = self._pose.topic_name
@@ -355,8 +340,26 @@ class HapticBridge(ManagedNode):
         return DiagnosticStatus.OK, str(machine.state), values
 
 
+def accepted_publishers(node: ManagedNode, device: DeviceSettings) -> frozenset[str]:
+    """Return who may publish the inputs: by the scene, and by the launcher's parameter."""
+    text = 'nodes, as /name, separated by commas: as device.accepted_publishers of the scene'
+    given = str(parameter(node, 'accepted_publishers', '', text))
+    return frozenset((*device.accepted_publishers, *filter(None, given.split(','))))
+
+
+def of_tissue(scene: Path) -> tuple[float, Friction]:
+    """Return the largest cutting resistance of the tissue by blade length [N/m], inf if it is
+    unknown, and its friction.
+    """
+    try:
+        material = read_section(scene, 'tissue', TissueSettings).material
+    except SceneError:  # a scene for the device alone, or one that tissue_sim rejects
+        return math.inf, NO_FRICTION
+    return material.toughness + material.blade_friction, material.dry_friction
+
+
 def main() -> None:
-    """Runs the node."""
+    """Run the node."""
     run(HapticBridge)
 
 

@@ -1,4 +1,4 @@
-"""The safety chain between the force law and the operator's hand: each link a small pure function.
+"""Safety chain between force law and operator's hand, as small pure functions.
 
 Order in `force_path`: gate of NaN and range, (force law), gate of the operating state, passivity
 observer and controller, slew limit, clamp to the device profile, soft start. Two promises hold for
@@ -9,38 +9,42 @@ at once.
 """
 
 import numpy as np
-from numba import njit
 
-OK, NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE, JUMP = range(5)
+from cutting_trainer.node_common.kernels import inner, kernel
+
+OK, NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE, JUMP, ROTATION_JUMP = range(6)
 POSE_FAULTS = {
     NOT_FINITE: 'the device pose is not finite',
     NOT_A_ROTATION: 'the orientation of the device is not a unit quaternion',
     OUT_OF_RANGE: 'the device is farther than 10 m from its origin: is its unit the metre?',
     JUMP: 'the device jumped: faster than 10 m/s between two poses',
+    ROTATION_JUMP: 'the device jumped: it turned faster than 60 rad/s between two poses',
 }
-FARTHEST_DEVICE = 10.0
+MAX_DEVICE_DISTANCE_M = 10.0
 """[m] from the origin of the device frame. Millimetres sent as metres exceed it at once."""
-FASTEST_DEVICE = 10.0
+MAX_DEVICE_SPEED_M_S = 10.0
 """[m/s]. A thrown hand reaches half of it."""
+MAX_ROTATION_SPEED_RAD_S = 60.0
+"""[rad/s]. A flick of the wrist reaches half of it."""
+NOMINAL_PERIOD_S = 1e-3
+"""[s] Shortest period assumed between two poses: stamps may be closer than the motion took."""
+MIN_WINDOW_S = 0.008
+"""[s] Window over which the whole motion is checked too: jitter of stamps averages out there."""
 
 
-@njit(cache=True, nogil=True)
+@inner
 def norm(v: np.ndarray) -> float:
-    """|v| of shape (3,); NaN where a component is."""
+    """Return |v| of shape (3,); NaN where a component is."""
     return np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
-@njit(cache=True, nogil=True)
-def pose_gate(
-    position: np.ndarray, orientation: np.ndarray, last: np.ndarray, elapsed: float
-) -> int:
-    """Whether a device pose can be believed.
+@kernel(nogil=True)
+def pose_gate(position: np.ndarray, orientation: np.ndarray) -> int:
+    """Check a device pose.
 
     Args:
         position: [m], device frame, shape (3,).
         orientation: quaternion x y z w, shape (4,).
-        last: position before [m], shape (3,).
-        elapsed: time between the two [s]; infinite where there is none before.
 
     Returns:
         OK or a key of POSE_FAULTS.
@@ -52,39 +56,65 @@ def pose_gate(
         return NOT_FINITE
     if abs(size - 1.0) > 0.02:
         return NOT_A_ROTATION
-    if norm(position) > FARTHEST_DEVICE:
+    if norm(position) > MAX_DEVICE_DISTANCE_M:
         return OUT_OF_RANGE
-    moved = 0.0
-    for k in range(3):
-        moved += (position[k] - last[k]) ** 2
-    # 1 ms more: two stamps of a 1 kHz stream can be closer than the motion between them took.
-    if np.sqrt(moved) > FASTEST_DEVICE * (elapsed + 1e-3):
-        return JUMP
     return OK
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
+def motion_gate(pose: np.ndarray, before: np.ndarray, elapsed: float) -> int:
+    """Check the motion of a device between two poses.
+
+    Args:
+        pose: position [m] and quaternion x y z w, device frame, shape (7,).
+        before: the same, earlier.
+        elapsed: time between the two [s].
+
+    Returns:
+        OK, JUMP or ROTATION_JUMP.
+    """
+    moved = cosine = 0.0
+    for k in range(3):
+        moved += (pose[k] - before[k]) ** 2
+    if np.sqrt(moved) > MAX_DEVICE_SPEED_M_S * elapsed:
+        return JUMP
+    ours = theirs = 0.0
+    for k in range(3, 7):
+        cosine += pose[k] * before[k]
+        ours += pose[k] ** 2
+        theirs += before[k] ** 2
+    # q and -q are the same rotation
+    cosine = min(abs(cosine) / np.sqrt(ours * theirs), 1.0)
+    if 2.0 * np.arccos(cosine) > MAX_ROTATION_SPEED_RAD_S * elapsed:
+        return ROTATION_JUMP
+    return OK
+
+
+@inner
 def state_gate(enabled: bool, force: np.ndarray) -> None:
-    """No force unless ENABLED. Force [N], shape (3,), changed in place."""
+    """Set the force to zero unless ENABLED. Force [N], shape (3,), changed in place."""
     if not enabled:
         force[:] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def freshness(age: float, stale_after: float, fade: float) -> float:
-    """Gain by the age [s] of the data: 1 up to stale_after, 0 from stale_after + fade on."""
+    """Return the gain by the age [s] of the data.
+
+    It is 1 up to stale_after, and 0 from stale_after + fade on.
+    """
     return min(max(1.0 - (age - stale_after) / fade, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def soft_start(elapsed: float, duration: float) -> float:
-    """Gain by the time [s] since the force was let in: grows from 0 to 1 within duration [s]."""
+    """Return the gain by the time since the force was enabled [s]: 0 to 1 within duration [s]."""
     return min(elapsed / duration, 1.0) if duration > 0.0 else 1.0
 
 
-@njit(cache=True, nogil=True)
+@inner
 def observe(energy: float, force: np.ndarray, displacement: np.ndarray) -> float:
-    """Passivity observer: energy [J] that the hand has put in, net of what it got back.
+    """Return the energy of the passivity observer [J]: net energy that the hand has put in.
 
     Args:
         energy: before [J].
@@ -96,12 +126,13 @@ def observe(energy: float, force: np.ndarray, displacement: np.ndarray) -> float
     )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def control(
     energy: float, velocity: np.ndarray, period: float, max_damping: float, force: np.ndarray
 ) -> float:
-    """Passivity controller (Hannaford and Ryu): damping that takes back within a period what was
-    made.
+    """Apply the passivity controller (Hannaford and Ryu) to a force.
+
+    Its damping removes the generated energy within a period.
 
     Args:
         energy: of the observer [J]; the controller acts only where it is negative.
@@ -124,9 +155,12 @@ def control(
     return damping
 
 
-@njit(cache=True, nogil=True)
+@inner
 def limit_slew(last: np.ndarray, largest: float, force: np.ndarray) -> None:
-    """At most `largest` [N] away from the last force. Forces [N], shape (3,), changed in place."""
+    """Limit the change since the last force to `largest` [N].
+
+    Forces [N], shape (3,), changed in place.
+    """
     step = np.sqrt(
         (force[0] - last[0]) ** 2 + (force[1] - last[1]) ** 2 + (force[2] - last[2]) ** 2
     )
@@ -135,26 +169,27 @@ def limit_slew(last: np.ndarray, largest: float, force: np.ndarray) -> None:
             force[k] = last[k] + (force[k] - last[k]) * (largest / step)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def clamp(ceiling: float, force: np.ndarray) -> None:
-    """Norm at most `ceiling` [N], direction kept. Force [N], shape (3,), changed in place."""
+    """Limit the norm to `ceiling` [N], direction kept. Force [N], shape (3,), changed in place."""
     size = norm(force)
     if size > ceiling:
         for k in range(3):
             force[k] *= ceiling / size
 
 
-@njit(cache=True, nogil=True)
+@inner
 def settle(
     last: np.ndarray, max_step: float, max_force: float, gain: float, force: np.ndarray
 ) -> None:
-    """Slew limit, norm clamp and gain (soft start, freshness) together, so that none undoes
-    another.
+    """Apply slew limit, norm clamp and gain (soft start, freshness) together.
 
-    The gain lowers the wanted force and the ceiling. The last force is brought under a ceiling that
-    has come down first, and what that took of the step is no longer there for the way to the wanted
-    force. A ceiling that falls faster than the force may (a soft start begins while force is on) is
-    followed at max_step: the result is within max_step of the last force always, and under the
+    In a row, one of them could undo another.
+
+    The gain lowers the wanted force and the ceiling. If the ceiling has come down, the last force
+    is brought under it first, and the rest of the step leads towards the wanted force. A ceiling
+    can fall faster than the force may, as when a soft start begins while force is on: it is
+    followed at max_step. The result is always within max_step of the last force, and under the
     ceiling as soon as that allows.
 
     Args:

@@ -1,4 +1,4 @@
-"""What a scene says about the tool, the device and the haptics, and what a device can do."""
+"""Scene sections `tool`, `device` and `haptics`, and the profile of a device."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -8,22 +8,26 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from haptic_bridge.orientation import from_rpy
-from tissue_sim.scene_file import SceneModel, nearest, syntax_error
-from tissue_sim.share import share_folder
+from cutting_trainer.node_common.orientation import from_rpy
+from cutting_trainer.node_common.scene_file import SceneModel, bounded_yaml, nearest, syntax_error
+from cutting_trainer.node_common.share import share_folder
+from cutting_trainer.node_common.yaml_bounds import YamlBoundError
+from cutting_trainer.tissue_sim.contact.tool import MIN_RADIUS_M
 
 Vector = tuple[float, float, float]
 Edge = Annotated[float, Field(gt=0, le=5)]
 
 
 class SettingsError(ValueError):
-    """A setting that cannot be; the message says which, where, and what would be right."""
+    """A setting that is not possible; the message says which, where, and the remedy."""
 
 
 class ToolSettings(SceneModel):
     """Scene section `tool`. The origin of the tool frame is the device's tip."""
 
-    radius: float = Field(0.004, gt=0, le=0.05, description='[m] of the sphere that touches')
+    radius: float = Field(
+        0.004, ge=MIN_RADIUS_M, le=0.05, description='[m] of the sphere that touches'
+    )
     coupling_stiffness: float = Field(
         200.0, ge=1, le=10_000, description='[N/m] of the spring between device and proxy'
     )
@@ -51,19 +55,19 @@ class Transform(SceneModel):
     scale: float = Field(1.0, gt=0, le=100, description='tissue motion over device motion')
 
     def rotation(self) -> np.ndarray:
-        """Rotation of vectors from the device frame to the tissue frame, shape (3, 3)."""
+        """Return the rotation from the device frame to the tissue frame, shape (3, 3)."""
         return from_rpy(self.rotation_rpy_deg)
 
     def to_tissue(self, positions: np.ndarray) -> np.ndarray:
-        """Maps device positions [m], shape (..., 3), to the tissue frame."""
+        """Map device positions [m], shape (..., 3), to the tissue frame."""
         return np.asarray(positions) @ (self.scale * self.rotation().T) + self.translation
 
     def to_device(self, positions: np.ndarray) -> np.ndarray:
-        """Maps tissue positions [m], shape (..., 3), to the device frame."""
+        """Map tissue positions [m], shape (..., 3), to the device frame."""
         return (np.asarray(positions) - self.translation) @ self.rotation() / self.scale
 
     def force_to_device(self, forces: np.ndarray) -> np.ndarray:
-        """Rotates tissue forces [N], shape (..., 3), into the device frame, unscaled."""
+        """Rotate tissue forces [N], shape (..., 3), into the device frame, unscaled."""
         return np.asarray(forces) @ self.rotation()
 
 
@@ -78,6 +82,9 @@ class DeviceSettings(SceneModel):
         'base',
         description='axes of servo_cf: of the device base (as drivers expect) or the tool body',
     )
+    force_topic: Literal['servo_cf', 'body/servo_cf', 'spatial/servo_cf'] = Field(
+        'servo_cf', description='topic below `arm` on which the device takes the force'
+    )
     force_sign: Literal[1, -1] = Field(
         1, description='-1 where the device takes the force on itself, not the one on the hand'
     )
@@ -90,39 +97,48 @@ class DeviceSettings(SceneModel):
     hold_button: bool = Field(
         False, description='force only while the button arm/button is pressed; else PAUSED'
     )
+    e_stop_button: int | None = Field(
+        None, ge=0, le=31, description='index into buttons of arm/button that presses E-STOP'
+    )
+    accepted_publishers: tuple[str, ...] = Field(
+        (),
+        max_length=32,
+        description='nodes, as /name, that alone may publish poses, forces and meshes for the '
+        'bridge; without any, the first of each topic may',
+    )
 
     def load_profile(self) -> 'DeviceProfile':
-        """Reads the limits of the chosen device."""
+        """Read the limits of the chosen device."""
         return DeviceProfile.load(share_folder() / 'config' / 'devices' / f'{self.profile}.yaml')
 
 
-Limit = Literal['max_force', 'max_slew', 'max_stiffness', 'workspace']
+LimitName = Literal['max_force', 'max_slew', 'max_stiffness', 'workspace']
 
 
 class DeviceProfile(SceneModel):
-    """What a device bears."""
+    """Limits of a device."""
 
     device: str = Field('', description='name of the device, for messages')
     max_force: float = Field(gt=0, le=100, description='[N] largest norm ever commanded')
     max_slew: float = Field(gt=0, le=100_000, description='[N/s] largest rate of the force')
     max_stiffness: float = Field(
-        gt=0, le=50_000, description='[N/m] largest that it renders stably'
+        gt=0, le=50_000, description='[N/m] largest stiffness that it renders stably'
     )
     workspace: tuple[Edge, Edge, Edge] | None = Field(
         None, description='[m] edges of the box in which the tip can be; without it, unknown'
     )
-    sources: dict[Limit, str] = Field({}, description='where each figure comes from')
+    sources: dict[LimitName, str] = Field({}, description='where each figure comes from')
 
     @classmethod
     def load(cls, path: Path) -> 'DeviceProfile':
-        """Reads a device file.
+        """Read a device file.
 
         Raises:
             SettingsError: the file is missing, or something in it is missing, unknown or out of
                 range.
         """
         try:
-            content = YAML(typ='safe', pure=True).load(path.read_text(encoding='utf-8'))
+            content = YAML(typ='safe', pure=True).load(bounded_yaml(path))
             return cls.model_validate(content)
         except FileNotFoundError:
             known = sorted(p.stem for p in path.parent.glob('*.yaml'))
@@ -133,13 +149,22 @@ class DeviceProfile(SceneModel):
             raise SettingsError(f'{path}: {_first_problem(error, cls)}') from None
         except YAMLError as error:
             raise SettingsError(syntax_error(path, error)) from None
+        except YamlBoundError as error:
+            raise SettingsError(error.of(path)) from None
+        except (ValueError, OSError) as error:  # no text, no date, a number without end
+            reason = ' '.join(str(error).split())[:120]
+            raise SettingsError(
+                f'{path} cannot be read: {reason}: write it in plain YAML'
+            ) from None
 
 
 def _first_problem(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first thing that is wrong with a file of one level, as a sentence."""
+    """Return the first fault of a file of one level, as a sentence."""
     problem = error.errors()[0]
     if not problem['loc']:
-        return f'the file is {problem["input"]!r}, but a profile is a mapping with max_force first'
+        return (
+            f'the file is {problem["input"]!r:.60}, but a profile is a mapping with max_force first'
+        )
     key, fields = str(problem['loc'][0]), model.model_fields
     if problem['type'] == 'extra_forbidden':
         near = nearest(key, fields)
@@ -150,21 +175,18 @@ def _first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     if problem['type'] == 'missing' and len(problem['loc']) == 1:
         return f'{key} is missing: {meaning}'
     place = '.'.join(map(str, problem['loc']))
-    return f'{place} is {problem["input"]!r}: {problem["msg"]} ({key}: {meaning})'
+    return f'{place} is {repr(problem["input"])[:60]}: {problem["msg"]} ({key}: {meaning})'
 
 
 class HapticsSettings(SceneModel):
     """Scene section `haptics`."""
 
     extrapolation: Literal['constant', 'time', 'position', 'local_stiffness'] = Field(
-        'local_stiffness', description='what becomes of the 30 Hz force between two frames'
-    )
-    contact: Literal['proxy', 'penalty', 'god_object'] = Field(
-        'proxy', description='how the tool is held out; the others are there to compare'
+        'local_stiffness', description='extrapolation of the 30 Hz force between two frames'
     )
     forces: Literal['two', 'one'] = Field(
         'two',
-        description="two: the hand feels the tissue's reaction; one: what the proxy does to it",
+        description="two: the hand feels the tissue's reaction; one: the force of the spring",
     )
     rate: float = Field(1000.0, ge=100, le=5000, description='[Hz] of the force loop')
     stale_after: float = Field(
@@ -188,7 +210,7 @@ class HapticsSettings(SceneModel):
 def check_together(
     tool: ToolSettings, device: DeviceSettings, haptics: HapticsSettings, profile: DeviceProfile
 ) -> None:
-    """Refuses settings that are right one by one but not together.
+    """Check that settings that are each right fit together.
 
     Raises:
         SettingsError: the fade needs more slew than the device has, or the coupling is too stiff.

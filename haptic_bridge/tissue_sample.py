@@ -1,25 +1,25 @@
-"""The force gate: what a `ForceSample` says, and whether it can be believed."""
+"""Decoding and validation of `ForceSample` messages."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from haptic_bridge.chain import INSIDE
-from haptic_bridge.wire import ForceSampleCodec, Sample
-from tissue_sim.refusals import MessageError
-from tissue_sim.replica import FARTHEST
+from cutting_trainer.haptic_bridge.chain import INSIDE
+from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
+from cutting_trainer.node_common.rejections import TOOLS, MessageError
+from cutting_trainer.tissue_sim.mesh.replica import MAX_COORDINATE
 
-LARGEST_FORCE = 1e3
-"""[N]. A simulation that diverges exceeds it long before it overflows."""
-LARGEST_STIFFNESS = 1e6
-"""[N/m] in each direction: of bone, as far as a hand can tell."""
-_LARGEST_COUNT = 2**63 - 1
+MAX_FORCE_N = 1e3
+"""[N]. A diverging simulation exceeds it long before it overflows."""
+MAX_STIFFNESS_N_M = 1e6
+"""[N/m] in each direction: stiffness of bone, the largest that a hand can distinguish."""
+_MAX_COUNT = 2**63 - 1
 _AT = ForceSampleCodec.fields
 
 
 class TissueSample(NamedTuple):
-    """One frame's reaction on the tool, see `ForceSample.msg`.
+    """Reaction on the tool in one frame, see `ForceSample.msg`.
 
     Attributes:
         step, revision, topology: of the simulation.
@@ -30,6 +30,7 @@ class TissueSample(NamedTuple):
         force: [N], shape (3,).
         stiffness: [N/m], shape (3, 3).
         resistance: largest force that the blade transmits [N].
+        tool: number of the tool that feels it.
     """
 
     step: int
@@ -42,10 +43,11 @@ class TissueSample(NamedTuple):
     force: np.ndarray
     stiffness: np.ndarray
     resistance: float
+    tool: int
 
     @classmethod
-    def read(cls, sample: Sample) -> 'TissueSample':
-        """Takes a decoded message apart."""
+    def read(cls, sample: StampedMessage) -> 'TissueSample':
+        """Decode a message."""
         step, revision, topology, sequence, seconds, nanoseconds, state = sample.values[:7]
         position, force, stiffness = (
             np.array(sample.values[_AT[name]]) for name in ('position', 'force', 'stiffness')
@@ -61,23 +63,25 @@ class TissueSample(NamedTuple):
             force,
             stiffness.reshape(3, 3),
             sample.values[_AT['resistance']][0],
+            int(sample.values[_AT['tool']][0]),
         )
 
     @property
     def problem(self) -> MessageError | None:
-        """Why it cannot be believed; None if it can."""
-        for name, size, most, unit in (
-            ('force', math.hypot(*self.force), LARGEST_FORCE, 'N'),
-            ('stiffness', np.abs(self.stiffness).max(), LARGEST_STIFFNESS, 'N/m'),
-            ('position', np.abs(self.position).max(), FARTHEST, 'm'),
-            ('resistance', self.resistance, LARGEST_FORCE, 'N'),
+        """Return why the sample is not plausible; None if it is."""
+        for name, size, limit, unit in (
+            ('force', math.hypot(*self.force), MAX_FORCE_N, 'N'),
+            ('stiffness', np.abs(self.stiffness).max(), MAX_STIFFNESS_N_M, 'N/m'),
+            ('position', np.abs(self.position).max(), MAX_COORDINATE, 'm'),
+            ('resistance', self.resistance, MAX_FORCE_N, 'N'),
             ('state', self.state, INSIDE, ''),
-            ('topology', self.topology, _LARGEST_COUNT, ''),
+            ('topology', self.topology, _MAX_COUNT, ''),
+            ('tool', self.tool, TOOLS - 1, ''),
         ):
-            if not 0 <= size <= most:  # a NaN is not
+            if not 0 <= size <= limit:  # a NaN is not
                 text = (
                     f'of frame {self.step} the {name} is {size:g} {unit}, not finite or not from '
-                    f'0 to {most:g} {unit}'
+                    f'0 to {limit:g} {unit}'
                 )
                 return MessageError(f'{name} that cannot be believed', ' '.join(text.split()))
         return None

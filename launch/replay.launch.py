@@ -5,8 +5,8 @@ from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackagePrefix
 
+from cutting_trainer.session.launching import PACKAGE, environment
 from launch import LaunchDescription
-from session.launching import PACKAGE, environment
 
 ARGUMENTS = {
     'bag': (None, 'folder of the bag'),

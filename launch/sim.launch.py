@@ -1,7 +1,7 @@
 """The simulation's side alone: tissue, cutting, recorder; `bridge.launch.py` where the arm is."""
 
+from cutting_trainer.session.launching import declared, environment, nodes
 from launch import LaunchDescription
-from session.launching import declared, environment, nodes
 
 NODES = ('tissue_sim', 'cutting', 'recorder')
 

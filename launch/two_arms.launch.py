@@ -1,7 +1,7 @@
 """Two trainers beside each other, a left and a right one, each with its arm and tissue; one bag."""
 
+from cutting_trainer.session.launching import declared, environment, nodes
 from launch import LaunchDescription
-from session.launching import declared, environment, nodes
 
 SIDES = ('left', 'right')
 NODES = ('emulated_arm', 'haptic_bridge', 'tissue_sim', 'cutting')
@@ -9,7 +9,10 @@ NODES = ('emulated_arm', 'haptic_bridge', 'tissue_sim', 'cutting')
 
 def generate_launch_description() -> LaunchDescription:
     """Declares the arguments and starts the nodes of both sides, and one recorder for all."""
-    arguments = declared('left_scene', 'right_scene', 'seed', 'seconds', 'auto_enable', 'bag')
+    arguments = declared(
+        *('left_scene', 'right_scene', 'seed', 'seconds', 'auto_enable', 'bag'),
+        'accepted_publishers',
+    )
     both = [
         node
         for side in SIDES

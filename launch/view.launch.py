@@ -2,12 +2,12 @@
 
 from launch.substitutions import LaunchConfiguration
 
+from cutting_trainer.session.launching import declared, environment, nodes
 from launch import LaunchDescription
-from session.launching import declared, environment, nodes
 
 
 def generate_launch_description() -> LaunchDescription:
     """Declares the arguments and starts the viewer."""
-    arguments = declared('scene', 'host', 'port', 'namespace', 'arm')
+    arguments = declared('scene', 'host', 'port', 'allow_host', 'namespace', 'arm', 'force_topic')
     viewer = nodes(('viewer',), device=LaunchConfiguration('arm'))
     return LaunchDescription([*arguments, *environment(), *viewer])

@@ -1,4 +1,4 @@
-"""Becomes another program that the kernel ends when this one's parent dies, whatever killed it.
+"""Execute another program that the kernel ends when the parent of this one dies.
 
 Run as a file: `python -I -S child.py PARENT_PID SIGNAL PROGRAM ARGUMENT...`. The process id stays.
 """

@@ -1,4 +1,4 @@
-"""A whole session: the nodes, the bag, the table, the verdict."""
+"""`trainer demo`: run a session, record its bag, print its table and its verdict."""
 
 import json
 import socket
@@ -11,12 +11,13 @@ from typing import Literal
 from rich.console import Console
 from rich.markup import escape
 
-from bags.errors import BagError
-from haptic_bridge.hand import compile_script
-from session.domain import reserved_domain
-from session.errors import SessionError
-from session.evidence import read_evidence
-from session.graph import (
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
+from cutting_trainer.node_common.share import PACKAGES, is_checkout
+from cutting_trainer.session.domain import reserved_domain
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.evidence import read_evidence
+from cutting_trainer.session.graph import (
     ARM_NODE,
     BRIDGE_NODE,
     LOCAL,
@@ -26,35 +27,36 @@ from session.graph import (
     session_nodes,
     viewer_command,
 )
-from session.judge import Expected, judge
-from session.node_process import NodeCommand
-from session.processes import Outcome, Supervisor
-from session.progress import SessionProgress
-from session.recordings.report import session_tables
-from session.scene import Scene, load_scene
-from session.status import Status
-from session.summary import Summary, summarise
-from tissue_sim.share import PACKAGES, is_checkout
+from cutting_trainer.session.judge import Expected, judge
+from cutting_trainer.session.node_process import NodeCommand
+from cutting_trainer.session.outcome import Outcome
+from cutting_trainer.session.progress import SessionProgress
+from cutting_trainer.session.report import session_tables
+from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.session.status import Status
+from cutting_trainer.session.summary import Summary, summarise
+from cutting_trainer.session.supervisor import Supervisor
+from cutting_trainer.session.terminal import session_console
 
 SESSIONS = (PACKAGES if is_checkout() else Path()) / 'bags' / 'sessions'
 """In the checkout; in the current folder where the trainer is installed."""
-SHORTEST, LONGEST = 1.0, 86400.0  # [s]
-OVERTIME = 15.0
-"""How long [s] a session may last beyond its script, which waits for the haptic bridge."""
+MIN_DURATION_S, MAX_DURATION_S = 1.0, 86400.0  # [s]
+MAX_OVERTIME_S = 15.0
+"""A session may last so much longer [s] than its script, which waits for the haptic bridge."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What the command line says.
+    """Options of `demo`.
 
     Attributes:
         scene: name or path.
-        seconds: duration of the arm's script [s]; None: what the scene says.
-        bag: folder of the new bag; None: one named after scene and time.
-        seed: of everything random.
+        seconds: duration of the arm's script [s]; None: that of the scene.
+        bag: folder of the new bag; None: a folder named after scene and time.
+        seed: seed of all random numbers.
         domain: ROS domain, or `free`.
         as_json: print the summary as JSON.
-        view: serve a page on this machine that shows the session.
+        view: serve a page on this machine with a view of the session.
     """
 
     scene: str
@@ -67,10 +69,10 @@ class DemoOptions:
 
 
 def run_demo(options: DemoOptions) -> Status:
-    """Runs a session and prints what became of it.
+    """Run a session and print its result.
 
     Raises:
-        SessionError, SceneError, SettingsError: it cannot be run like this.
+        SessionError, SceneError, SettingsError: an option or the scene is not valid.
     """
     scene = load_scene(options.scene)
     seconds = script_seconds(scene, options.seconds)
@@ -78,26 +80,26 @@ def run_demo(options: DemoOptions) -> Status:
     nodes = session_nodes(scene.path, bag, options.seed, seconds)
     if options.view:
         nodes.insert(0, viewer_command(scene.path, LOCAL, page_port(), session=False))
-    notes = Console(stderr=True)
+    notes = session_console()
     with reserved_domain(options.domain) as domain:
         outcome = run_nodes(nodes, seconds, bag, node_environment(domain), notes)
-    return conclude(outcome, bag, expected_of(scene), as_json=options.as_json)
+    return conclude(outcome, bag, expectations(scene), as_json=options.as_json)
 
 
 def conclude(outcome: Outcome, bag: Path, expected: Expected, *, as_json: bool) -> Status:
-    """Prints what became of a session.
+    """Print the result of a session.
 
     Args:
-        outcome: of its processes.
-        bag: that it was recorded into.
-        expected: by its scene.
+        outcome: outcome of its processes.
+        bag: bag of the session.
+        expected: expectations of its scene.
         as_json: print the summary as JSON.
     """
     console, notes = Console(), Console(stderr=True)
     if outcome.interrupted and not outcome.deaths:
         notes.print(f'interrupted (exit status {int(Status.INTERRUPTED)})', highlight=False)
     if not outcome.ran:
-        return not_run(outcome, bag, notes)
+        return report_failed_start(outcome, bag, notes)
     try:
         with notes.status('reading the bag'):
             summary = summarise(read_evidence(bag))
@@ -114,18 +116,19 @@ def conclude(outcome: Outcome, bag: Path, expected: Expected, *, as_json: bool) 
     return _status(outcome, failures)
 
 
-def expected_of(scene: Scene) -> Expected:
-    """What a session of a scene should do."""
+def expectations(scene: Scene) -> Expected:
+    """Return the expectations of a scene: rates, and whether it cuts."""
     rates = {
         TISSUE_NODE: scene.tissue.integration.rate,
         BRIDGE_NODE: scene.haptics.rate,
         ARM_NODE: scene.arm.rate,
     }
-    return Expected(rates, cut=scene.arm.script.cuts)
+    script = scene.arm.script
+    return Expected(rates, cut=script is not None and script.cuts)
 
 
 def page_port() -> int:
-    """The usual one; where another page has it 0, which is one that is free."""
+    """Return the default port; 0, which is any free port, where the default is taken."""
     try:
         with socket.create_server((LOCAL, PORT)):
             return PORT
@@ -134,27 +137,31 @@ def page_port() -> int:
 
 
 def script_seconds(scene: Scene, asked: float | None) -> float:
-    """Of the arm's script [s], refused where the hand would have to be too fast."""
-    seconds = asked
+    """Return the duration of the arm's script [s].
+
+    Raises:
+        SessionError, SettingsError: it is out of range, or the hand would be too fast.
+    """
+    script, seconds = scene.arm.require_script(), asked
     if seconds is None:
-        seconds = scene.session.seconds or scene.arm.script.seconds
-    elif not SHORTEST <= seconds <= LONGEST:
+        seconds = scene.session.seconds or script.seconds
+    elif not MIN_DURATION_S <= seconds <= MAX_DURATION_S:
         raise SessionError(
-            f'--seconds is {seconds:g}: give a number from {SHORTEST:g} to {LONGEST:g}'
+            f'--seconds is {seconds:g}: give a number from {MIN_DURATION_S:g} to {MAX_DURATION_S:g}'
         )
-    compile_script(scene.arm.script, scene.device.tissue_from_device, seconds)
+    compile_script(script, scene.device.tissue_from_device, seconds)
     return seconds
 
 
 def new_bag(asked: Path | None, scene: str) -> Path:
-    """Where the recorder will make the bag, refused where it could not.
+    """Return the folder that the recorder will make the bag in.
 
     Args:
-        asked: what the user wants; None: one in `SESSIONS`.
-        scene: that the latter is named after.
+        asked: folder that the user names; None: a new one in `SESSIONS`.
+        scene: scene that the folder in `SESSIONS` is named after.
 
     Raises:
-        SessionError: it exists already, or cannot be made.
+        SessionError: the folder exists already, or cannot be made.
     """
     if asked == Path():
         raise SessionError('--bag names no folder: give the path of a new one')
@@ -186,31 +193,31 @@ def run_nodes(
     *,
     restart: bool = False,
 ) -> Outcome:
-    """Runs the nodes of a session until the arm's script is over.
+    """Run the nodes of a session until the end of the arm's script.
 
     Args:
-        nodes: to run.
+        nodes: nodes to run.
         seconds: duration of the script [s].
-        bag: folder of the bag; gets the nodes' logs.
-        environment: of the nodes.
-        notes: where the progress is shown.
-        restart: start nodes that die again.
+        bag: folder of the bag and of the nodes' logs.
+        environment: environment of the nodes.
+        notes: console for the progress.
+        restart: restart nodes that die.
     """
     with (
         SessionProgress(notes, len(nodes)) as progress,
-        Supervisor(nodes, bag / 'log', environment, progress.tell, restart=restart) as supervisor,
+        Supervisor(nodes, bag / 'log', environment, progress.show, restart=restart) as supervisor,
     ):
         if supervisor.start():
             supervisor.run(
-                seconds + OVERTIME,
+                seconds + MAX_OVERTIME_S,
                 until_done=ARM_NODE,
                 tick=lambda elapsed: progress.tick(elapsed, seconds),
             )
         return supervisor.end()
 
 
-def not_run(outcome: Outcome, bag: Path, notes: Console) -> Status:
-    """Says why the nodes did not come up."""
+def report_failed_start(outcome: Outcome, bag: Path, notes: Console) -> Status:
+    """Print the reason why the nodes did not start; return the exit status."""
     if outcome.interrupted:
         return Status.INTERRUPTED
     for death in outcome.deaths:
@@ -221,7 +228,7 @@ def not_run(outcome: Outcome, bag: Path, notes: Console) -> Status:
             notes.print(f'  {death.node}: {escape(line)}', highlight=False)
     if outcome.unready:
         notes.print(f'[bold red]error:[/] {escape(outcome.unready)}', highlight=False)
-    notes.print(f'all that the nodes said is in {escape(str(bag / "log"))}', highlight=False)
+    notes.print(f'the logs of the nodes are in {escape(str(bag / "log"))}', highlight=False)
     return Status.NODE_DIED if outcome.deaths else Status.FAILED
 
 

@@ -1,4 +1,4 @@
-"""One session a ROS domain: two at once would take each other's messages for their own."""
+"""Reservation of a ROS domain: two sessions in one domain would mix their messages."""
 
 import os
 import socket
@@ -7,30 +7,30 @@ from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Literal
 
-from session.errors import SessionError
+from cutting_trainer.session.errors import SessionError
 
 Side = Literal['bridge', 'sim']
 SIDES: tuple[Side, ...] = ('bridge', 'sim')
-"""The two halves of a session: where the device is, and where the tissue is computed."""
-LARGEST_DOMAIN = 101
-"""Above it, DDS's ports reach into those that Linux gives to anybody."""
+"""Hosts of a session: the one with the device, and the one that computes the tissue."""
+MAX_DOMAIN = 101
+"""Above this domain, DDS uses ports of Linux's ephemeral range."""
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
 _FIRST_PARTICIPANT = 10
 _CREDENTIALS = struct.Struct('3i')
 
 
 def parse_domain(text: str) -> int | Literal['free']:
-    """What the user says, else what the environment says, else 0.
+    """Return the domain of the user's text, else of the environment, else 0.
 
     Raises:
-        SessionError: it is neither `free` nor a number from 0 to `LARGEST_DOMAIN`.
+        SessionError: it is neither `free` nor a number from 0 to `MAX_DOMAIN`.
     """
     if text == 'free':
         return 'free'
     number = text or os.environ.get('ROS_DOMAIN_ID') or '0'
-    if not number.isdecimal() or int(number) > LARGEST_DOMAIN:
+    if not number.isdecimal() or int(number) > MAX_DOMAIN:
         name = '--domain' if text else 'ROS_DOMAIN_ID'
-        raise SessionError(f'{name} is {number!r}: give a number from 0 to {LARGEST_DOMAIN}')
+        raise SessionError(f'{name} is {number!r}: give a number from 0 to {MAX_DOMAIN}')
     return int(number)
 
 
@@ -38,14 +38,14 @@ def parse_domain(text: str) -> int | Literal['free']:
 def reserved_domain(
     domain: int | Literal['free'], sides: Collection[Side] = SIDES
 ) -> Iterator[int]:
-    """Keeps a domain for one session on this machine; the kernel frees it with the process.
+    """Reserve a domain for one session on this machine; the kernel frees it with the process.
 
     Args:
         domain: its number, or `free` for the first that neither a session nor other DDS uses.
-        sides: of the session that run here.
+        sides: sides of the session that run here.
 
     Raises:
-        SessionError: a session is running in it.
+        SessionError: a session is running in the domain.
     """
     if domain != 'free':
         reservation = _reserve(domain, sides)
@@ -60,12 +60,12 @@ def _address(domain: int, side: Side) -> str:
 
 
 def _reserve(domain: int, sides: Collection[Side]) -> ExitStack:
-    """Both sides of a session, or the one that runs here.
+    """Reserve a domain for some sides of a session.
 
     Raises:
-        SessionError: somebody else has one of them.
+        SessionError: another process has reserved one of them.
     """
-    # An abstract socket has the life of its process and the reach of its network, as DDS has.
+    # Like DDS, an abstract socket ends with its process and is local to its network namespace.
     with ExitStack() as stack:
         for side in sides:
             reservation = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -92,16 +92,17 @@ def _holder(domain: int, side: Side) -> int | str:
 
 
 def _first_free(sides: Collection[Side]) -> tuple[int, ExitStack]:
-    for domain in range(1, LARGEST_DOMAIN + 1):
+    for domain in range(1, MAX_DOMAIN + 1):
         with suppress(SessionError):
             reservation = _reserve(domain, sides)
-            if not _has_participants(domain):
+            if not has_participants(domain):
                 return domain, reservation
             reservation.close()
-    raise SessionError(f'no ROS domain from 1 to {LARGEST_DOMAIN} is free: end a session first')
+    raise SessionError(f'no ROS domain from 1 to {MAX_DOMAIN} is free: end a session first')
 
 
-def _has_participants(domain: int) -> bool:
+def has_participants(domain: int) -> bool:
+    """Return whether some DDS of this machine is in a domain."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(('', FIRST_PORT + PORTS_PER_DOMAIN * domain + _FIRST_PARTICIPANT))

@@ -1,5 +1,5 @@
-"""The one kind of error that a user of the command line can mend."""
+"""The error that a user of the command line can correct."""
 
 
 class SessionError(ValueError):
-    """A request that cannot be met; the message is a sentence that says what would be right."""
+    """A request that cannot be met; the message is a sentence that names the correct input."""

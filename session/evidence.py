@@ -1,4 +1,4 @@
-"""What a bag has to say about a session, as plain numbers."""
+"""Measurements of a session, read from its bag."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.reader import open_bag
-from bags.sequences import SequenceCounter
-from bags.topics import CONTACT, DIAGNOSTICS, SERVO_CF, of_session
-from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
-from session.graph import MODULES
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.sequences import SequenceCounter
+from cutting_trainer.bags.topics import CONTACT, DIAGNOSTICS, SERVO_CF, of_session
+from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
+from cutting_trainer.session.graph import MODULES
 
-SHARED = (DIAGNOSTICS, '/parameter_events', '/rosout')
-"""Topics that every node publishes on: their messages are of several sequences."""
-NANOSECOND = 1e-9
+SHARED_TOPICS = (DIAGNOSTICS, '/parameter_events', '/rosout')
+"""Topics with one publisher per node, and so with several sequences of messages."""
+NANOSECOND_S = 1e-9
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Status:
     """One status of one node on /diagnostics.
 
     Attributes:
-        time: when it was recorded [s].
-        node: its name.
+        time: time of recording [s].
+        node: name of the node.
         level: 0 OK, 1 WARN, 2 ERROR, 3 STALE.
-        message: its sentence.
-        values: as text, by key.
+        message: sentence of the status.
+        values: values as text, by key.
     """
 
     time: float
@@ -38,7 +38,7 @@ class Status:
     values: dict[str, str]
 
     def number(self, key: str) -> float:
-        """A value as a number; NaN where there is none."""
+        """Return a value as a number; NaN where there is none."""
         try:
             return float(self.values[key])
         except (KeyError, ValueError):
@@ -47,18 +47,18 @@ class Status:
 
 @dataclass
 class Evidence:
-    """A session's bag. Times are those of recording, [s] since its first message.
+    """Measurements of a bag. Times are times of recording, [s] since its first message.
 
     Attributes:
-        bag: its folder.
+        bag: folder of the bag.
         complete: whether the bag was closed in order.
         duration: [s].
-        contacts: time and whether something is touched, by `tool/contact`, shape (n, 2).
+        contacts: time and contact flag of `tool/contact`, shape (n, 2).
         forces: time and norm [N] of `arm/servo_cf`, shape (m, 2).
-        statuses: all of /diagnostics.
-        messages: how many, by topic.
-        lost: messages that were published after the first that came, and did not, by topic.
-        unheard: messages published before the first that came, by topic.
+        statuses: all statuses of /diagnostics.
+        messages: number of messages, by topic.
+        lost: number of messages missing after the first received one, by topic.
+        unheard: number of messages published before the first received one, by topic.
     """
 
     bag: Path
@@ -73,7 +73,7 @@ class Evidence:
 
 
 def read_evidence(folder: Path) -> Evidence:
-    """Reads a bag once.
+    """Read the measurements of a bag in one pass.
 
     Raises:
         BagError: it is not a bag.
@@ -89,7 +89,7 @@ def read_evidence(folder: Path) -> Evidence:
     for message in bag.messages():
         start = start or message.log_time
         end = max(end, message.log_time)
-        time = (message.log_time - start) * NANOSECOND
+        time = (message.log_time - start) * NANOSECOND_S
         if message.sequence:
             counters[message.topic].add(message.sequence)
         evidence.messages[message.topic] = evidence.messages.get(message.topic, 0) + 1
@@ -99,7 +99,7 @@ def read_evidence(folder: Path) -> Evidence:
             forces.append((time, np.linalg.norm(wrench_codec.decode(message.data).values[force])))
         elif message.topic == DIAGNOSTICS:
             evidence.statuses += _statuses(bag.read(message), time)
-    evidence.duration = (end - start) * NANOSECOND
+    evidence.duration = (end - start) * NANOSECOND_S
     evidence.contacts = np.array(contacts, float).reshape(-1, 2)
     evidence.forces = np.array(forces, float).reshape(-1, 2)
     evidence.lost = {topic: c.lost for topic, c in counters.items() if c.lost}
@@ -108,7 +108,7 @@ def read_evidence(folder: Path) -> Evidence:
 
 
 def _count_publishers(topic: str) -> int:
-    return len(MODULES) if topic in SHARED else 1
+    return len(MODULES) if topic in SHARED_TOPICS else 1
 
 
 def _statuses(array: Any, time: float) -> list[Status]:

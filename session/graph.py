@@ -1,55 +1,59 @@
-"""The nodes of a session, as commands in the order in which they are ended."""
+"""Commands of the nodes of a session, in the order of their end."""
 
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from session.node_process import NodeCommand
-from tissue_sim.share import PACKAGES, share_folder
+from cutting_trainer.node_common.share import PACKAGES, share_folder
+from cutting_trainer.session.node_process import NodeCommand
 
 ARM_NODE, BRIDGE_NODE, TISSUE_NODE = 'emulated_arm', 'haptic_bridge', 'tissue_sim'
 CUTTING_NODE, RECORDER_NODE, VIEWER_NODE = 'cutting', 'recorder', 'viewer'
 
 MODULES = {
-    ARM_NODE: 'haptic_bridge.arm_node',
-    BRIDGE_NODE: 'haptic_bridge.node',
-    TISSUE_NODE: 'tissue_sim.node',
-    CUTTING_NODE: 'cutting.node',
-    RECORDER_NODE: 'bags.node',
-    VIEWER_NODE: 'viewer.node',
+    ARM_NODE: 'cutting_trainer.haptic_bridge.emulated_arm.node',
+    BRIDGE_NODE: 'cutting_trainer.haptic_bridge.node',
+    TISSUE_NODE: 'cutting_trainer.tissue_sim.node',
+    CUTTING_NODE: 'cutting_trainer.cutting.node',
+    RECORDER_NODE: 'cutting_trainer.bags.node',
+    VIEWER_NODE: 'cutting_trainer.viewer.node',
 }
 SIM_SIDE = (TISSUE_NODE, CUTTING_NODE)
-"""What may run on another host than the device."""
+"""Nodes that may run on another host than the device."""
 SIMULATION = (ARM_NODE, BRIDGE_NODE, TISSUE_NODE, CUTTING_NODE)
-"""The nodes of a session, without who only listens."""
-AGAIN: dict[str, dict[str, object]] = {
+"""Nodes of a session, without those that only subscribe."""
+SESSION_PUBLISHERS = f'/{ARM_NODE},/{TISSUE_NODE}'
+"""Publishers of poses, forces and meshes in a session with the emulated arm."""
+RESTART_PARAMETERS: dict[str, dict[str, object]] = {
     BRIDGE_NODE: {'auto_enable': False},
     TISSUE_NODE: {'resume': True},
     RECORDER_NODE: {'resume': True},
 }
-"""Parameters of nodes that take the place of one that died: no force without a command, the tissue
-as it was, a bag beside the one that was cut off."""
-CLOSING_A_BAG = 20.0  # [s]
+"""Parameters of restarted nodes: no force without a command, the tissue in its last state, a new
+bag beside the truncated one."""
+E_STOP_PARAMETERS: dict[str, dict[str, object]] = {BRIDGE_NODE: {'e_stop_pressed': True}}
+"""Parameters of nodes that start while E-STOP is pressed."""
+RECORDER_GRACE_S = 20.0  # [s]
 LOCAL, PORT = '127.0.0.1', 8080
-"""Where the page is served unless the user says else."""
+"""Default address and port of the page."""
 RANGE, PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[NodeCommand]:
-    """Commands for the five nodes.
+    """Return commands for the five nodes.
 
     Args:
-        scene: file that all of them read.
+        scene: scene file of all nodes.
         bag: folder of the new bag.
-        seed: of everything random.
+        seed: seed of all random numbers.
         seconds: duration of the arm's script [s].
     """
     own: dict[str, dict[str, object]] = {
         ARM_NODE: {'seconds': float(seconds)},
-        BRIDGE_NODE: {'auto_enable': True},
+        BRIDGE_NODE: {'auto_enable': True, 'accepted_publishers': SESSION_PUBLISHERS},
     }
     common = {'scene': str(scene), 'seed': seed}
     commands = [node_command(name, common | own.get(name, {})) for name in SIMULATION]
@@ -57,16 +61,17 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
 
 
 def simulation_nodes(scene: Path, seed: int, checkpoint: Path) -> list[NodeCommand]:
-    """Commands for a session that waits for its operator: the hand has no script, no force is on.
+    """Return commands for a session that waits for its operator, without script and force.
 
     Args:
-        scene: file that all of them read.
-        seed: of everything random.
-        checkpoint: file in which the tissue is kept.
+        scene: scene file of all nodes.
+        seed: seed of all random numbers.
+        checkpoint: file of the tissue's state.
     """
     common = {'scene': str(scene), 'seed': seed}
     own: dict[str, dict[str, object]] = {
         ARM_NODE: {'guided': True},
+        BRIDGE_NODE: {'accepted_publishers': SESSION_PUBLISHERS},
         TISSUE_NODE: {'checkpoint': str(checkpoint)},
     }
     return [node_command(name, common | own.get(name, {})) for name in SIMULATION]
@@ -75,15 +80,15 @@ def simulation_nodes(scene: Path, seed: int, checkpoint: Path) -> list[NodeComma
 def bridge_side_nodes(
     scene: Path, bag: Path, seed: int, seconds: float, *, arm: bool
 ) -> list[NodeCommand]:
-    """Commands for the host with the device: the bridge, the recorder, and an arm if none is there.
+    """Return commands for the host with the device: bridge, recorder, and optionally an arm.
 
     Args:
-        scene: file that all of them read.
+        scene: scene file of all nodes.
         bag: folder of the new bag.
-        seed: of everything random.
+        seed: seed of all random numbers.
         seconds: duration of the arm's script [s].
-        arm: whether the emulated arm takes the place of a device; else the bridge waits for an
-            operator who enables it.
+        arm: run the emulated arm in the place of a device; else the bridge waits for an operator
+            who enables it.
     """
     nodes = session_nodes(scene, bag, seed, seconds)
     if not arm:
@@ -95,71 +100,80 @@ def bridge_side_nodes(
 def sim_side_nodes(
     scene: Path, seed: int, checkpoint: Path, mesh_bandwidth: float
 ) -> list[NodeCommand]:
-    """Commands for the host that computes the tissue.
+    """Return commands for the host that computes the tissue.
 
     Args:
-        scene: file that both sides read.
-        seed: of everything random.
-        checkpoint: file in which the tissue is kept.
-        mesh_bandwidth: most that goes out for meshes [bytes/s]; 0: no limit.
+        scene: scene file of both sides.
+        seed: seed of all random numbers.
+        checkpoint: file of the tissue's state.
+        mesh_bandwidth: limit of the outgoing mesh data [bytes/s]; 0: no limit.
     """
     common: dict[str, object] = {'scene': str(scene), 'seed': seed}
     kept = {'checkpoint': str(checkpoint), 'mesh_bandwidth': mesh_bandwidth}
     return [node_command(TISSUE_NODE, common | kept), node_command(CUTTING_NODE, common)]
 
 
-def viewer_command(scene: Path, host: str, port: int, *, session: bool) -> NodeCommand:
-    """The page.
+def viewer_command(
+    scene: Path, host: str, port: int, *, session: bool, allow_host: Sequence[str] = ()
+) -> NodeCommand:
+    """Return the command of the node that serves the page.
 
     Args:
-        scene: file that the session runs.
-        host, port: where the page is served.
-        session: whether the launcher does what the page asks for.
+        scene: scene file of the session.
+        host, port: address and port of the page.
+        session: the launcher answers requests of the page.
+        allow_host: host names under which the page is served.
     """
     parameters = {'scene': str(scene), 'host': host, 'port': port, 'session': session}
+    parameters['allow_host'] = ','.join(allow_host)
     return replace(node_command(VIEWER_NODE, parameters), converses=session)
 
 
 def node_command(
     name: str, parameters: Mapping[str, object], remapped: Mapping[str, str] | None = None
 ) -> NodeCommand:
-    """A node to run.
+    """Return the command of a node.
 
     Args:
-        name: one of `MODULES`.
-        parameters: by name.
-        remapped: topics and services by the names that the node's code gives them.
+        name: key of `MODULES`.
+        parameters: parameters by name.
+        remapped: new names of topics and services, by their names in the node's code.
     """
     renamed = [f'{before}:={after}' for before, after in (remapped or {}).items()]
     remaps = tuple(word for rule in renamed for word in ('-r', rule))
     argv = _argv(MODULES[name], parameters) + remaps
-    return NodeCommand(name, argv, again=_parameters(AGAIN.get(name, {})))
+    again, stopped = (
+        _parameters(given.get(name, {})) for given in (RESTART_PARAMETERS, E_STOP_PARAMETERS)
+    )
+    return NodeCommand(
+        name, argv, restart_arguments=again, e_stop_arguments=stopped, has_heartbeat=True
+    )
 
 
 def recorder_command(
     scene: Path | None, bag: Path, seed: int, parameters: Mapping[str, object] | None = None
 ) -> NodeCommand:
-    """The recorder, which is ended last and has time to close its bag.
+    """Return the command of the recorder, which ends last and has time to close its bag.
 
     Args:
-        scene: file of which the text goes into the bag; None: not known.
+        scene: scene file, copied into the bag; None: unknown.
         bag: folder of the new bag.
-        seed: goes into the bag.
-        parameters: others of the node, by name.
+        seed: seed, written into the bag.
+        parameters: further parameters of the node, by name.
     """
     own = {'scene': str(scene or ''), 'seed': seed, 'bag': str(bag)}
     command = node_command(RECORDER_NODE, own | dict(parameters or {}))
-    return replace(command, records=True, grace=CLOSING_A_BAG)
+    return replace(command, records=True, grace=RECORDER_GRACE_S)
 
 
 def discovery(environ: Mapping[str, str]) -> dict[str, str]:
-    """The variables that keep the nodes to this machine unless the shell says else.
+    """Return the variables that restrict the nodes to this machine unless the shell sets others.
 
-    The profile does what the range LOCALHOST asks for: with that word, rmw_fastrtps would add
-    transports of its own, shared memory and sockets on all interfaces (config/dds/localhost.xml).
+    The profile restricts the range, not the value LOCALHOST: with that, rmw_fastrtps would add
+    transports, namely shared memory and sockets on all interfaces (config/dds/localhost.xml).
 
     Args:
-        environ: of the shell.
+        environ: environment of the shell.
     """
     folder = share_folder() / 'config' / 'dds'
     local, network = (str(folder / f'{name}.xml') for name in ('localhost', 'network'))
@@ -172,25 +186,25 @@ def discovery(environ: Mapping[str, str]) -> dict[str, str]:
 
 
 def arm_command(scene: Path, **parameters: object) -> NodeCommand:
-    """The emulated arm alone."""
+    """Return the command of the emulated arm alone."""
     values = {'scene': str(scene), **parameters}
-    return NodeCommand(ARM_NODE, _argv(MODULES[ARM_NODE], values))
+    return NodeCommand(ARM_NODE, _argv(MODULES[ARM_NODE], values), has_heartbeat=True)
 
 
 def _argv(module: str, parameters: Mapping[str, object]) -> tuple[str, ...]:
-    # What a node says goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
+    # Output of a node goes to the log in the bag; ROS would keep a copy in ~/.ros/log for ever.
     argv = [sys.executable, '-m', module, '--ros-args', '--disable-external-lib-logs']
     return (*argv, *_parameters(parameters))
 
 
 def _parameters(values: Mapping[str, object]) -> tuple[str, ...]:
-    # Of a parameter that is given twice, the last one holds.
+    # The last value of a repeated parameter holds.
     given = [f'{key}:={json.dumps(value, ensure_ascii=False)}' for key, value in values.items()]
     return tuple(word for text in given for word in ('-p', text))
 
 
 def node_environment(domain: int) -> dict[str, str]:
-    """The one environment of all nodes: this process's own, on this machine unless it says else.
+    """Return the environment of the nodes: that of this process, with a ROS domain.
 
     Args:
         domain: ROS domain.

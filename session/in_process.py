@@ -1,4 +1,4 @@
-"""Tissue, force loop and the way between them in one process and in a time of its own.
+"""Tissue, force loop and the link between them in one process, in simulated time.
 
 Nothing here waits and nothing is random but by seed, so a session gives the same bits again. What
 the nodes and their messages do in the graph is done here with the same cores: the contact that is
@@ -12,16 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from cutting.method import CutMethod, SweepError
-from haptic_bridge.force_path import ForcePath, Tick
-from haptic_bridge.operating_state import State
-from haptic_bridge.surface import Surface
-from haptic_bridge.wire import ContactCodec, Sample
-from tissue_sim.contact import Command, Frame, ToolContact
-from tissue_sim.contact import State as ToolState
-from tissue_sim.simulation import TissueSimulation
+from cutting_trainer.cutting.method import CutMethod, outcome_of
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.haptic_bridge.contact_values import Tick
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.node_common.cdr_codec import ContactCodec, StampedMessage
+from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.tissue_sim.assembly import make_simulation
+from cutting_trainer.tissue_sim.contact.tool import ContactState, CutOutcome, Frame, ToolContact
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
+from cutting_trainer.tissue_sim.simulation.cut_transaction import CutTransaction
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
-TICK = 0.001
+TICK_S = 0.001
 """[s] of the force loop."""
 _NS = 1_000_000
 _START_NS = 10**9
@@ -30,7 +35,7 @@ _PLACES = ContactCodec.fields
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """The way between the force loop and the tissue, the same in both directions.
+    """Link between the force loop and the tissue, the same in both directions.
 
     Attributes:
         delay: [s] of each direction.
@@ -48,13 +53,13 @@ class LinkSettings:
 
 
 class _Channel:
-    """Hands messages over in order, later, and some of them never.
+    """Deliver messages in order with delay and loss.
 
     A message that is held up holds up those behind it, as a reliable connection does.
     """
 
     def __init__(self, link: LinkSettings, delay: float, random: np.random.Generator) -> None:
-        self._delay = delay / TICK
+        self._delay = delay / TICK_S
         self._link = link
         self._random = random
         self._queue: deque[tuple[int, Any]] = deque()
@@ -63,7 +68,7 @@ class _Channel:
         link = self._link
         if link.loss and self._random.random() < link.loss:
             return
-        late = link.jitter / TICK * self._random.random() if link.jitter else 0.0
+        late = link.jitter / TICK_S * self._random.random() if link.jitter else 0.0
         self._queue.append((tick + round(self._delay + late), message))
 
     def arrived(self, tick: int) -> list[Any]:
@@ -74,7 +79,7 @@ class _Channel:
 
 
 class Tissue:
-    """The simulation with its cuts answered one frame later, as `tissue_sim` and `cutting` do it.
+    """The simulation with its cuts, by the protocol of `tissue_sim` and `cutting`.
 
     Args:
         simulation: of the tissue.
@@ -84,41 +89,42 @@ class Tissue:
     def __init__(self, simulation: TissueSimulation, method: CutMethod | None = None) -> None:
         self.simulation = simulation
         self._method = method
-        self._asked: Frame | None = None
+        self._cut = CutTransaction(simulation)
 
     def frame(self, contact: ToolContact | None) -> Frame:
-        """One frame under a contact."""
-        self._answer()
+        """Return one frame under a contact."""
+        if self._cut.due:
+            self._cut.resolve(*self._answer())
         frame = self.simulation.frame(contact)
-        if frame.command is not None:
-            self._asked = frame
+        self._cut.ask(frame)
         return frame
 
-    def _answer(self) -> None:
-        if self._asked is None:
-            return
-        asked, self._asked = self._asked, None
-        simulation = self.simulation
+    def _answer(self) -> tuple[CutOutcome, TopologyDelta | None]:
         if self._method is None:
-            simulation.cut_failed()
-            return
-        positions = simulation.positions
-        try:
-            if asked.command is Command.FINISH or asked.sweep is None:
-                result = self._method.finish(simulation.mesh, positions)
-            else:
-                result = self._method.advance(simulation.mesh, positions, asked.sweep)
-        except SweepError:
-            simulation.cut_failed()
-            return
-        if result.delta.empty:
-            simulation.cut_done()
-        else:
-            simulation.apply_cut(result.delta)
+            return CutOutcome.EMPTY, None
+        assert self._cut.asked is not None
+        return answer(self._method, self._cut.asked, self.simulation)
+
+
+def answer(
+    method: CutMethod, asked: Frame, simulation: TissueSimulation
+) -> tuple[CutOutcome, TopologyDelta]:
+    """Return the answer of `cutting` to the command of the newest frame.
+
+    Args:
+        method: of cutting.
+        asked: a frame with a command.
+        simulation: as that frame left it.
+    """
+    assert asked.command is not None
+    outcome, result = outcome_of(
+        method, simulation.mesh, simulation.positions, asked.command, asked.sweep
+    )
+    return outcome, result.delta
 
 
 def tool_contact(values: Sequence[float]) -> ToolContact:
-    """What `Contact` says, from the numbers of a tick, as `tissue_sim.messages` reads it."""
+    """Return the contact of a tick, as it is published."""
 
     def get(name: str) -> np.ndarray:
         return np.array(values[_PLACES[name]], float)
@@ -126,7 +132,7 @@ def tool_contact(values: Sequence[float]) -> ToolContact:
     nodes, slots = np.unique(get('nodes').astype(np.int64), return_inverse=True)
     weights = np.bincount(slots, get('weights'), len(nodes))
     return ToolContact(
-        state=ToolState(int(get('state')[0])),
+        state=ContactState(int(get('state')[0])),
         topology=int(get('topology')[0]),
         nodes=nodes[weights > 0],
         weights=weights[weights > 0],
@@ -138,6 +144,7 @@ def tool_contact(values: Sequence[float]) -> ToolContact:
         blade_root=get('blade_root'),
         blade_tip=get('blade_tip'),
         sequence=int(get('sequence')[0]),
+        external=get('external_force'),
     )
 
 
@@ -171,14 +178,14 @@ class InProcess:
         self._newest: tuple[int, tuple[float, ...]] | None = None
         self._latest: Surface | None = None
         self._surface = self._surface_now()
-        self._sample: Sample | None = None
+        self._sample: StampedMessage | None = None
 
     def tick(
         self,
         position: np.ndarray,
         orientation: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0, 1.0),
     ) -> Tick:
-        """One period of the force loop with the device at a pose.
+        """Run one period of the force loop with the device at a pose.
 
         Args:
             position: [m], device frame, shape (3,).
@@ -187,22 +194,22 @@ class InProcess:
         now = _START_NS + self.ticks * _NS
         for surface, sample in self._down.arrived(self.ticks):
             self._surface, self._sample = surface, sample
-        pose = Sample(now, '', (*map(float, position), *orientation))
+        pose = StampedMessage(now, '', (*map(float, position), *orientation))
         out = self.path.tick(
-            now, state=State.ENABLED, pose=pose, sample=self._sample, surface=self._surface
+            now, state=CrtkState.ENABLED, pose=pose, sample=self._sample, surface=self._surface
         )
         if out.fault:
             raise RuntimeError(f'tick {self.ticks}: {out.fault}')
         self._sample = None
         self._up.send(self.ticks, (out.contact_stamp_ns, out.contact))
         self.ticks += 1
-        if self.ticks * TICK * self._rate >= self._frames + 1 - 1e-9:
+        if self.ticks * TICK_S * self._rate >= self._frames + 1 - 1e-9:
             self._simulate()
         return out
 
     def wait(self, seconds: float, position: np.ndarray) -> None:
-        """Lets time [s] pass with the device at rest at a position [m]."""
-        for _ in range(round(seconds / TICK)):
+        """Let time [s] pass with the device at rest at a position [m]."""
+        for _ in range(round(seconds / TICK_S)):
             self.tick(position)
 
     def _simulate(self) -> None:
@@ -228,10 +235,33 @@ class InProcess:
         )
         return self._latest
 
-    def _sample_of(self, frame: Frame, sequence: int, stamp: int) -> Sample:
+    def _sample_of(self, frame: Frame, sequence: int, stamp: int) -> StampedMessage:
         topology = self.tissue.simulation.mesh.topology
         head = (frame.step, frame.step, topology, sequence, *divmod(stamp, 10**9))
         vectors = np.concatenate([frame.position, frame.force, frame.stiffness.ravel()])
-        tail = (frame.resistance, frame.kinetic_energy, frame.elastic_energy)
+        tail = (frame.resistance, frame.kinetic_energy, frame.elastic_energy, 0)
         end = _START_NS + self.ticks * _NS
-        return Sample(end, 'tissue', (*head, int(frame.state), *vectors.tolist(), *tail))
+        return StampedMessage(end, 'tissue', (*head, int(frame.state), *vectors.tolist(), *tail))
+
+
+def make_force_path(scene: Scene) -> ForcePath:
+    """Return the force loop of a scene, before its first tick."""
+    friction = scene.tissue.material.dry_friction
+    return ForcePath(scene.tool, scene.device, scene.haptics, scene.profile, friction=friction)
+
+
+def simulate(scene: str, link: LinkSettings | None = None) -> InProcess:
+    """Return a scene's force loop and tissue, to be moved tick by tick.
+
+    Args:
+        scene: name of a scene in config/scenes, or path of a scene file.
+        link: between the two; None: without delay and loss.
+
+    Raises:
+        SessionError: there is no such scene.
+        SceneError, SettingsError, MeshError: the scene or its mesh cannot be used.
+    """
+    said = load_scene(scene)
+    simulation, _ = make_simulation(said.tissue)
+    tissue = Tissue(simulation, make_method(said.cutting))
+    return InProcess(make_force_path(said), tissue, said.tissue.integration.rate, link)

@@ -1,36 +1,36 @@
-"""Did a session do what it should have? Every "no" is a sentence."""
+"""Comparison of a session with the expectations of its scene; each failure is a sentence."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from session.processes import Outcome
-from session.summary import Summary
+from cutting_trainer.session.outcome import Outcome
+from cutting_trainer.session.summary import Summary
 
-RATE_TOLERANCE = 0.1
-NO_FORCE = 1e-3  # [N]
-REPORTED = 5.0
-"""Length [s] from which a session has reports of the rates after its first second; of a shorter one
-they are not judged."""
+RELATIVE_RATE_TOLERANCE = 0.1
+MAX_RESIDUAL_FORCE_N = 1e-3  # [N]
+MIN_JUDGED_DURATION_S = 5.0
+"""Shorter sessions [s] have no report of rates after their first second, and are not judged by
+them."""
 ERROR_LEVEL = 2
-STOOD_STILL = 0.02
-"""[s] between two turns of a loop of 1 kHz after which a bridge takes its device for silent."""
+MAX_LOOP_PERIOD_S = 0.02
+"""Period of a 1 kHz loop [s] above which a bridge takes its device for silent."""
 _SLOW = (
     ': the machine is busy, or the scene too heavy for it; see ./trainer doctor and '
     './trainer plan SCENE'
 )
 _UNRECORDED = (
-    'the recorder got too few turns: the machine is busy; see ./trainer doctor. The session is '
-    'there but for these messages, and can be computed again up to the first contact that it lacks'
+    'the recorder had too little processor time: the machine is busy; see ./trainer doctor. The '
+    'rest of the session is recorded, and can be recomputed up to the first missing contact'
 )
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What a scene asks of a session.
+    """Expectations of a scene.
 
     Attributes:
-        rates: [Hz] of the nodes that have one.
+        rates: nominal rates by node [Hz].
         cut: the arm's script has a phase that cuts.
     """
 
@@ -39,15 +39,15 @@ class Expected:
 
 
 def judge(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
-    """What the session should have done and did not.
+    """Compare a session with its expectations.
 
     Args:
-        summary: of its bag.
-        outcome: of its processes.
-        expected: by its scene.
+        summary: summary of its bag.
+        outcome: outcome of its processes.
+        expected: expectations of its scene.
 
     Returns:
-        Sentences; none if all is well. An interrupted session need not have got anywhere.
+        A sentence for each failure. An interrupted session need not have reached its goals.
     """
     return [
         *outcome.troubles,
@@ -62,7 +62,7 @@ def judge(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
 def _bag(summary: Summary) -> list[str]:
     failures = []
     if not summary.complete:
-        failures.append(f'{summary.bag} was not closed: what is there up to then can be read')
+        failures.append(f'{summary.bag} was not closed: it can be read up to its last message')
     if summary.lost:
         lost = ', '.join(f'{count} messages of {topic}' for topic, count in summary.lost.items())
         failures.append(f'{lost} were lost on the way to the bag: {_UNRECORDED}')
@@ -75,11 +75,11 @@ def _rates(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
         node = summary.nodes.get(name)
         if node is None:
             failures.append(f'{name} never reported on /diagnostics')
-        elif math.isnan(node.rate) and outcome.seconds < REPORTED:
+        elif math.isnan(node.rate) and outcome.seconds < MIN_JUDGED_DURATION_S:
             continue
         elif math.isnan(node.rate):
             failures.append(f'{name} never reported its rate on /diagnostics')
-        elif abs(node.rate - nominal) > RATE_TOLERANCE * nominal:
+        elif abs(node.rate - nominal) > RELATIVE_RATE_TOLERANCE * nominal:
             why = _SLOW if node.rate < nominal else ''
             failures.append(f'{name} ran at {node.rate:.4g} Hz instead of {nominal:g} Hz{why}')
     return failures
@@ -94,35 +94,35 @@ def _errors(summary: Summary) -> list[str]:
 
 
 def _held_up(summary: Summary, expected: Expected) -> list[str]:
-    """What explains an error: loops that got no turn."""
+    """Return causes of an error: loops that had no processor time."""
     if not _errors(summary):
         return []
     return [
-        f'{node.name} got no turn for {1e3 * node.longest_period:.0f} ms: the machine is busy, or '
+        f'{node.name} did not run for {1e3 * node.longest_period:.0f} ms: the machine is busy, or '
         'its host takes the processor away; see ./trainer doctor, then try again'
         for name, rate in expected.rates.items()
-        if rate * STOOD_STILL > 1
+        if rate * MAX_LOOP_PERIOD_S > 1
         and (node := summary.nodes.get(name))
-        and node.longest_period > STOOD_STILL
+        and node.longest_period > MAX_LOOP_PERIOD_S
     ]
 
 
 def _touch(summary: Summary, outcome: Outcome, expected: Expected) -> list[str]:
     failures = []
-    if summary.force_before_contact > NO_FORCE:
+    if summary.force_before_contact > MAX_RESIDUAL_FORCE_N:
         failures.append(
             f'there was a force of {summary.force_before_contact:.3g} N before the first contact'
         )
     if not outcome.finished:
         failures.append(f'the arm did not finish its script within {outcome.seconds:.0f} s')
     if not summary.complete:
-        return failures  # what came after the end of the bag is not known
+        return failures  # nothing is known of the time after the end of the bag
     if not summary.contact_time:
         failures.append('the tool never touched the tissue')
     elif not summary.largest_force:
         failures.append('the contact was never felt: the force on the arm was zero throughout')
     after = summary.force_after_contact
-    if outcome.finished and after is not None and after > NO_FORCE:
+    if outcome.finished and after is not None and after > MAX_RESIDUAL_FORCE_N:
         failures.append(f'there was a force of {after:.3g} N still after the last contact')
     if expected.cut and not summary.elements_cut:
         failures.append('nothing was cut, although the script has a cut in it')

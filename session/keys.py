@@ -1,5 +1,6 @@
-"""Single keys from a terminal, without waiting."""
+"""Keys of a terminal, read without blocking."""
 
+import contextlib
 import os
 import select
 import sys
@@ -8,22 +9,25 @@ import tty
 from types import TracebackType
 from typing import Any, Self
 
+_LOCAL_FLAGS = 3
+"""Index of the local flags in the attributes of `tcgetattr`."""
+
 
 class Keys:
-    """Reads keys as they are pressed; a context manager. Where there is no terminal, none come.
+    """Read keys as they are pressed; a context manager. Without a terminal there are no keys.
 
-    Nor do they where the terminal belongs to another program: the system would stop this one.
+    Nor are there any in the background of a terminal: the system would stop this process.
+
+    Args:
+        active: read the terminal.
     """
 
-    def __init__(self) -> None:
-        file = sys.stdin.fileno() if sys.stdin and sys.stdin.isatty() else -1
-        self._file = -1 if file < 0 or _of_another(file) else file
+    def __init__(self, *, active: bool = True) -> None:
+        self._file = sys.stdin.fileno() if active and sys.stdin and sys.stdin.isatty() else -1
         self._before: list[Any] = []
 
     def __enter__(self) -> Self:
-        if self._file >= 0:
-            self._before = termios.tcgetattr(self._file)
-            tty.setcbreak(self._file)
+        self._take()
         return self
 
     def __exit__(
@@ -32,19 +36,36 @@ class Keys:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._file >= 0:
-            termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
+        if self._before and not _of_another(self._file):
+            with contextlib.suppress(termios.error):  # the terminal was closed
+                termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> str:
-        """What was pressed since the last call, '' for nothing."""
-        if self._file < 0 or not select.select([self._file], [], [], 0.0)[0]:
+        """Return the keys pressed since the last call, '' for none."""
+        if not self._take() or not select.select([self._file], [], [], 0.0)[0]:
             return ''
-        return os.read(self._file, 64).decode(errors='replace')
+        try:
+            return os.read(self._file, 64).decode(errors='replace')
+        except OSError:  # the terminal was closed
+            return ''
+
+    def _take(self) -> bool:
+        """Switch to single keys; return the success. A shell undoes it when it stops a job."""
+        if self._file < 0 or _of_another(self._file):
+            return False
+        try:
+            now = termios.tcgetattr(self._file)
+            if now[_LOCAL_FLAGS] & termios.ICANON:
+                self._before = self._before or now
+                tty.setcbreak(self._file)
+        except termios.error:  # the terminal was closed
+            return False
+        return True
 
 
 def _of_another(terminal: int) -> bool:
-    """Whether this process runs in the background of its terminal."""
+    """Return whether this process runs in the background of its terminal."""
     try:
         return os.tcgetpgrp(terminal) != os.getpgrp()
-    except OSError:  # it is not the one that this process was started from
+    except OSError:  # it is not the controlling terminal of this process
         return False

@@ -1,6 +1,6 @@
-"""What the launch files share: the nodes of a graph, with the parameters of the command line.
+"""Shared parts of the launch files: nodes of a graph, with parameters of the command line.
 
-Needs launch and launch_ros, which a ROS from Ubuntu packages has and the wheels have not.
+This module needs launch and launch_ros. ROS from Ubuntu packages has them, the wheels do not.
 """
 
 import os
@@ -13,7 +13,13 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from session.graph import ARM_NODE, BRIDGE_NODE, RECORDER_NODE, VIEWER_NODE, discovery
+from cutting_trainer.session.graph import (
+    ARM_NODE,
+    BRIDGE_NODE,
+    RECORDER_NODE,
+    VIEWER_NODE,
+    discovery,
+)
 
 PACKAGE = 'cutting_trainer'
 ARGUMENTS: dict[str, tuple[Any, str]] = {
@@ -23,30 +29,43 @@ ARGUMENTS: dict[str, tuple[Any, str]] = {
     'seed': ('0', 'seed of everything random'),
     'seconds': ('20.0', "duration that the arm's script is stretched to [s]"),
     'auto_enable': ('true', 'whether the bridge enables itself and the arm'),
+    'accepted_publishers': (
+        '',
+        'comma-separated nodes, as /name, that alone may publish poses, forces and meshes',
+    ),
     'bag': ('session', 'new folder for the bag'),
     'namespace': ('', 'of all nodes and topics, for more than one trainer in a graph'),
     'host': ('127.0.0.1', 'address that the page is served on; 0.0.0.0: open to other machines'),
     'port': ('8080', 'port of the page'),
+    'allow_host': ('', 'comma-separated host names under which the page is served'),
     'arm': ('arm', 'namespace of the device, as in /MTML for /MTML/measured_cp'),
+    'force_topic': (
+        'servo_cf',
+        'topic below it on which the device takes the force, unless the scene sets it: servo_cf, '
+        'body/servo_cf or spatial/servo_cf',
+    ),
 }
 TYPES = {
     **{'scene': str, 'seed': int, 'seconds': float, 'auto_enable': bool, 'bag': str},
-    **{'host': str, 'port': int},
+    **{'host': str, 'port': int, 'allow_host': str, 'accepted_publishers': str},
 }
 USUAL = ('scene', 'seed')
 PARAMETERS = {
     ARM_NODE: (*USUAL, 'seconds'),
-    BRIDGE_NODE: (*USUAL, 'auto_enable'),
+    BRIDGE_NODE: (*USUAL, 'auto_enable', 'accepted_publishers'),
     RECORDER_NODE: (*USUAL, 'bag'),
-    VIEWER_NODE: ('scene', 'host', 'port'),
+    VIEWER_NODE: ('scene', 'host', 'port', 'allow_host'),
 }
-"""Of the nodes that have others than `USUAL`."""
-OF_DEVICE = ('measured_cp', 'servo_cf', 'button', 'operating_state', 'state_command')
-"""Topics by which bridge, viewer and device know each other."""
+"""Parameters of the nodes that need others than `USUAL`."""
+DEVICE_TOPICS = (
+    *('measured_cp', 'servo_cf', 'body/servo_cf', 'spatial/servo_cf'),
+    *('button', 'operating_state', 'state_command'),
+)
+"""Topics between bridge, viewer and device."""
 
 
 def declared(*names: str, **defaults: str) -> list[Any]:
-    """Arguments of a launch file, by their names in `ARGUMENTS`, some with other defaults."""
+    """Return arguments of a launch file, named as in `ARGUMENTS`, some with other defaults."""
     liver = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'scenes', 'liver.yaml'])
     return [
         DeclareLaunchArgument(
@@ -66,17 +85,18 @@ def nodes(
     arguments: Mapping[str, str] | None = None,
     device: Any = None,
 ) -> list[Any]:
-    """Nodes of a session.
+    """Return nodes of a session.
 
     Args:
-        names: of them, which are those of their executables too.
-        namespace: theirs; None: that of the argument `namespace`.
-        arguments: names of launch arguments that stand for others, as `left_scene` for `scene`.
-        device: namespace that they find the device in; None: `arm`, below their own.
+        names: names of the nodes and of their executables.
+        namespace: namespace of the nodes; None: the argument `namespace`.
+        arguments: launch arguments that replace others, as `left_scene` replaces `scene`.
+        device: namespace of the device; None: `arm`, below that of the nodes.
     """
     where = LaunchConfiguration('namespace') if namespace is None else namespace
     called = arguments or {}
-    remapped = [(f'arm/{topic}', [device, f'/{topic}']) for topic in OF_DEVICE]
+    chosen = {'servo_cf': ['/', LaunchConfiguration('force_topic')]}
+    remapped = [(f'arm/{t}', [device, *chosen.get(t, [f'/{t}'])]) for t in DEVICE_TOPICS]
     return [
         Node(
             package=PACKAGE,
@@ -99,5 +119,5 @@ def nodes(
 
 
 def environment() -> list[Any]:
-    """Keeps the nodes to this machine unless the shell says else, as the command line does."""
+    """Restrict the nodes to this machine unless the shell sets another range."""
     return [SetEnvironmentVariable(*item) for item in discovery(os.environ).items()]

@@ -1,4 +1,4 @@
-"""Which hosts a session's nodes talk to: this one alone, unless the user asks for more."""
+"""Hosts that the nodes of a session communicate with: by default this one alone."""
 
 import ipaddress
 import os
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from session.errors import SessionError
-from session.graph import PROFILES, RANGE, discovery, node_environment
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.graph import PROFILES, RANGE, discovery, node_environment
 
 PEERS, SERVER = 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'
 EVERYTHING = 'ROS_SUPER_CLIENT'
@@ -20,13 +20,13 @@ _DDS = '{http://www.eprosima.com}'
 
 @dataclass(frozen=True)
 class Network:
-    """How far the graph reaches.
+    """Reach of the graph.
 
     Attributes:
         open: find nodes of other hosts by multicast.
-        peers: addresses or names of hosts to look for; needs no multicast.
+        peers: addresses or names of hosts to connect to; needs no multicast.
         server: `HOST` or `HOST:PORT` of a Fast DDS discovery server.
-        partition: name that a node must share to be heard, '' for the nodes without one.
+        partition: DDS partition; nodes communicate within one, '' is the default.
     """
 
     open: bool = False
@@ -40,13 +40,13 @@ class Network:
         return self.open or bool(self.peers) or bool(self.server)
 
     def variables(self, environ: Mapping[str, str]) -> dict[str, str]:
-        """What the environment of the nodes says of it.
+        """Return the variables of the environment for this reach.
 
         Args:
-            environ: of the shell; what it says holds where this says nothing.
+            environ: environment of the shell, which provides the defaults.
 
         Raises:
-            SessionError: an address cannot be one.
+            SessionError: an address is not valid.
         """
         given = dict(environ)
         if self.leaves:
@@ -60,21 +60,21 @@ class Network:
                 raise SessionError(
                     f'--discovery-server is {self.server!r}: its port is no number up to 65535'
                 )
-            found[EVERYTHING] = 'TRUE'  # the recorder asks for topics that it does not have
+            found[EVERYTHING] = 'TRUE'  # the recorder must discover topics that it does not know
             found[SERVER] = f'{_host(host, "--discovery-server")}:{port or SERVER_PORT}'
         return found
 
 
 @contextmanager
 def network_environment(domain: int, network: Network) -> Iterator[dict[str, str]]:
-    """The environment of the nodes, with a file of its own where it needs one.
+    """Yield the environment of the nodes, with a temporary DDS profile where there is a partition.
 
     Args:
         domain: ROS domain.
-        network: how far the graph reaches.
+        network: reach of the graph.
 
     Raises:
-        SessionError: an address cannot be one, or the partition has no name that DDS takes.
+        SessionError: an address, or the name of the partition, is not valid.
     """
     environment = node_environment(domain) | network.variables(os.environ)
     if not network.partition:
@@ -101,7 +101,7 @@ def _host(name: str, option: str) -> str:
 
 
 def _in_partition(profile: Path, partition: str) -> bytes:
-    """A DDS profile, with all publishers and subscribers in a partition."""
+    """Return a DDS profile, with all publishers and subscribers in a partition."""
     ElementTree.register_namespace('', _DDS.strip('{}'))
     tree = ElementTree.parse(profile)
     profiles = tree.getroot().find(f'{_DDS}profiles')

@@ -1,34 +1,45 @@
-"""One node as a process of the operating system: its command, its lines, its log, its end."""
+"""Process of one node: its command, its output, its log, its end."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
-TAIL = 6
-LONGEST_LINE = 1 << 16
+from cutting_trainer.node_common.output import HEARTBEAT, Outlet
+
+MAX_TAIL_LINES = 6
+MAX_LINE_BYTES = 1 << 16
+CUT_OFF = f' (cut off: longer than {MAX_LINE_BYTES} bytes)'
+MAX_READS = 16
+HEARTBEAT_PERIOD_S = 0.5
+LOG_CLOSE_TIMEOUT_S = 2.0
+"""Time [s] that the end of a node waits for the disk to write the last lines of its log."""
 _BOUND = (sys.executable, '-I', '-S', str(Path(__file__).with_name('child.py')))
 
 
 @dataclass(frozen=True)
 class NodeCommand:
-    """One node to run.
+    """Command of a node.
 
     Attributes:
-        name: of the node, as in its line `ready: NAME`.
+        name: name of the node, as in its line `ready: NAME`.
         argv: program and arguments.
-        records: it keeps the record of the others: it starts before them, ends after them, and is
-            asked to end, not killed, when the launcher dies or the user is in a hurry.
-        converses: it asks for things by lines `message: ...`, and reads answers on standard input.
-        grace: [s] that it has to end after SIGINT, and half of it again after SIGTERM.
-        again: further arguments for a start in the place of one that died.
+        records: it records the others. It starts before them and ends after them. It gets SIGTERM,
+            not SIGKILL, when the launcher dies, and keeps its grace after a second interrupt.
+        converses: it sends requests in lines `message: ...`, and reads answers on standard input.
+        grace: time to end after SIGINT [s], and half of it again after SIGTERM.
+        restart_arguments: further arguments of a restart after a death.
+        e_stop_arguments: further arguments of a start while E-STOP is pressed. A node with such
+            arguments reads the line `e_stop` on standard input, and writes `e_stop: pressed` or
+            `e_stop: released`.
+        has_heartbeat: it writes heartbeats once it is ready.
     """
 
     name: str
@@ -36,86 +47,98 @@ class NodeCommand:
     records: bool = False
     converses: bool = False
     grace: float = 5.0
-    again: tuple[str, ...] = ()
+    restart_arguments: tuple[str, ...] = ()
+    e_stop_arguments: tuple[str, ...] = ()
+    has_heartbeat: bool = False
 
 
 class _Log:
-    """Lines of one node, kept until the folder that they belong into exists: its owner makes it.
+    """Log of one node, held in memory until the parent of its folder exists.
 
-    A line that comes again and again is written once, with how often: a library that complains of
-    each message writes as many as come.
+    A repeated line is written once, with the number of repetitions: some libraries write a line for
+    each message. A thread writes, so that a disk that hangs delays nothing.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._waiting: list[str] = []
-        self._file: BinaryIO | None = None
+        self._outlet: Outlet | None = None
         self._last, self._again = '', 0
 
     def write(self, line: str) -> None:
         if line == self._last:
             self._again += 1
             return
-        self._tell_again()
+        self._write_repetitions()
         self._last = line
         self._waiting.append(line)
         if self._path.parent.parent.is_dir():
             self.flush()
 
     def flush(self) -> None:
-        if self._waiting and self._file is None:
+        if self._waiting and self._outlet is None:
             try:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = self._path.open('ab', buffering=0)
+                flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+                self._outlet = Outlet(os.open(self._path, flags, 0o666), 'the disk')
             except OSError:
-                return  # where no bag could be made, no log can be kept; the recorder says why
-        if self._file is not None:
-            with suppress(OSError):  # the disk is full: the recorder says so, the session goes on
-                self._file.write(''.join(f'{line}\n' for line in self._waiting).encode())
+                return  # there is no bag, so there is no folder for logs; the recorder reports it
+        if self._outlet is not None:
+            self._outlet.put(''.join(f'{line}\n' for line in self._waiting).encode())
             self._waiting.clear()
 
-    def _tell_again(self) -> None:
+    def _write_repetitions(self) -> None:
         if self._again:
             self._waiting.append(f'(the same {self._again} times more)')
             self._again = 0
 
     def close(self) -> None:
-        self._tell_again()
+        self._write_repetitions()
         self.flush()
-        if self._file is not None:
-            self._file.close()
+        if self._outlet is not None:
+            self._outlet.close(LOG_CLOSE_TIMEOUT_S)
+            self._outlet = None
 
 
 class NodeProcess:
-    """A node that was started, and what it has said so far.
+    """A node that was started, and the state that it has reported.
 
     Attributes:
-        tail: the last lines that it wrote.
-        ready, done: it has said so.
-        asked_to_end: its end from now on is no accident.
+        tail: last lines of its output.
+        ready, done: it has reported so.
+        asked_to_end: its end is expected from now on.
         silent: it has closed its output.
-        warnings: how many it has given.
+        warnings: number of its warnings.
+        unread: number of its lines `message: ...` that could not be read.
+        beat: time of its last heartbeat, on the supervisor's clock [s].
+        hung: it was killed because its heartbeat stopped.
 
     Args:
-        command: what to run.
-        log: file for its lines.
-        environment: of the process.
+        command: command of the node.
+        log: file of its log.
+        environment: environment of the process.
     """
 
     def __init__(self, command: NodeCommand, log: Path, environment: Mapping[str, str]) -> None:
         self.command = command
         self.log = _Log(log)
-        self.tail: deque[str] = deque(maxlen=TAIL)
+        self.tail: deque[str] = deque(maxlen=MAX_TAIL_LINES)
         self.ready = self.done = self.asked_to_end = self.silent = False
-        self.warnings = 0
+        self.warnings = self.unread = 0
+        self.beat = 0.0
+        self.hung = False
         self._rest = b''
+        self._skipping = False
+        beating = {HEARTBEAT: f'{HEARTBEAT_PERIOD_S:g}'} if command.has_heartbeat else {}
         orphaned = signal.SIGTERM if command.records else signal.SIGKILL
         self.process = subprocess.Popen(
             [*_BOUND, str(os.getpid()), str(int(orphaned)), *command.argv],
-            stdin=subprocess.PIPE if command.converses else subprocess.DEVNULL,
+            stdin=subprocess.PIPE
+            if command.converses or command.e_stop_arguments
+            else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env=dict(environment),
+            env=dict(environment) | beating,
             process_group=0,
         )
         assert self.process.stdout is not None
@@ -133,7 +156,7 @@ class NodeProcess:
         return self.process.returncode is None
 
     def reap(self) -> bool:
-        """Whether the process has ended since the last call; takes what it started along."""
+        """Return whether the process has ended since the last call; kill its children if so."""
         if not self.alive:
             return False
         seen = os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
@@ -144,13 +167,13 @@ class NodeProcess:
         return True
 
     def answer(self, text: str) -> None:
-        """Writes a line to a node that converses, as long as it lives and listens."""
+        """Write a line to a node that converses, if it runs and reads."""
         if self.process.stdin is not None:
             with contextlib.suppress(BrokenPipeError, BlockingIOError):
                 os.write(self.process.stdin.fileno(), f'{text}\n'.encode())
 
     def close(self) -> None:
-        """Closes what belongs to a process that has ended."""
+        """Close the log and the pipes of a process that has ended."""
         self.log.close()
         self.pipe.close()
         if self.process.stdin is not None:
@@ -161,32 +184,66 @@ class NodeProcess:
             self.process.send_signal(number)
 
     def send_group(self, number: signal.Signals) -> None:
-        """To the node and whatever it started; only before it was reaped is the number its own."""
+        """Send a signal to the process group of the node. Call it before the node is reaped: the
+        process id may be reused later.
+        """
         try:
             os.killpg(self.process.pid, number)
         except (ProcessLookupError, PermissionError):
             self.send(number)
 
     def lines(self) -> Iterator[str]:
-        """The complete lines that have come in."""
-        while True:
+        """Yield the complete lines that have arrived, and the beginning of a line that is too long.
+
+        One call reads at most `MAX_READS` times: a node that floods must not delay the others.
+        """
+        for _ in range(MAX_READS):
             try:
                 data = os.read(self.pipe.fileno(), 1 << 16)
             except BlockingIOError:
                 return
             *lines, self._rest = (self._rest + data).split(b'\n')
-            if self._rest and (not data or len(self._rest) > LONGEST_LINE):
-                lines, self._rest = [*lines, self._rest], b''
             for line in lines:
-                yield line.decode(errors='replace').rstrip()
+                if not self._skipping:
+                    yield _text(line)
+                self._skipping = False
+            if self._rest and not self._skipping and (not data or len(self._rest) > MAX_LINE_BYTES):
+                yield _text(self._rest)
+                self._skipping = True
+            if self._skipping:  # up to the end of the long line
+                self._rest = b''
             if not data:
                 self.silent = True
                 return
 
 
+def _text(line: bytes) -> str:
+    text = line[:MAX_LINE_BYTES].decode(errors='replace').rstrip()
+    return text + CUT_OFF if len(line) > MAX_LINE_BYTES else text
+
+
+def parse_message(text: str) -> dict[str, Any] | None:
+    """Return the content of a line `message: TEXT`; None where it cannot be read."""
+    try:
+        message = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return message if isinstance(message, dict) else None
+
+
 def is_warning(line: str) -> bool:
-    """Whether a node's line is one that the user should see at once."""
+    """Return whether a line is a warning or an error, which the user should see at once."""
     head = line[:60].lower()
     return head.startswith(('warning:', 'error:')) or any(
         level in head for level in ('[warn]', '[error]', '[fatal]')
     )
+
+
+def unready_sentence(waiting: Sequence[NodeProcess], timeout: float) -> str:
+    """Return a sentence on nodes that were not ready in `timeout` [s], with their last lines."""
+    said = '; '.join(
+        f'{node.name} said last: {" / ".join(node.tail) or "nothing"}' for node in waiting
+    )
+    names = ' and '.join(node.name for node in waiting)
+    hint = 'is the machine busy? see ./trainer doctor'
+    return f'{names} not ready within {timeout:g} s ({hint}); {said}'

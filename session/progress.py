@@ -1,6 +1,5 @@
-"""What a running session shows: one live line on a terminal, plain lines elsewhere."""
+"""Progress of a running session: one live line on a terminal, plain lines elsewhere."""
 
-import json
 import re
 from types import TracebackType
 from typing import Self
@@ -9,18 +8,20 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
-from session.processes import Event
+from cutting_trainer.session.supervisor import Event
+from cutting_trainer.session.terminal import settle
 
 _STAMP = re.compile(r'^\[[A-Z]+\] \[[\d.]+\] \[[^]]*\]: ')
+_MAX_LINK = 1000
 _STYLES = {'warning': 'yellow', 'died': 'bold red', 'killed': 'red'}
 
 
 class SessionProgress:
-    """Shows the events of a supervisor and how far the session is; a context manager.
+    """Show the events of a supervisor and the progress of the session; a context manager.
 
     Args:
-        console: to write to.
-        nodes: how many are waited for.
+        console: console to write to.
+        nodes: number of nodes to wait for.
     """
 
     def __init__(self, console: Console, nodes: int) -> None:
@@ -50,9 +51,10 @@ class SessionProgress:
         trace: TracebackType | None,
     ) -> None:
         self._bar.stop()
+        settle(self._console)
 
-    def tell(self, event: Event) -> None:
-        """Shows one event."""
+    def show(self, event: Event) -> None:
+        """Show one event."""
         text = escape(event.text)
         if event.kind == 'ready':
             self._ready += 1
@@ -64,8 +66,9 @@ class SessionProgress:
             )
             self._plainly(f'{event.node} is ready')
         elif event.kind == 'message':
-            page = json.loads(event.text)['page']
-            self._console.print(f'page: {page}', highlight=False, soft_wrap=True)
+            if page := event.content.get('page'):
+                link = escape(str(page)[:_MAX_LINK])
+                self._console.print(f'page: {link}', highlight=False, soft_wrap=True)
         elif event.kind == 'phase':
             self._phase = text
             self._plainly(text)
@@ -77,11 +80,11 @@ class SessionProgress:
             self._console.print(text, style=_STYLES[event.kind], highlight=False)
 
     def tick(self, elapsed: float, seconds: float) -> None:
-        """Shows how far the session is.
+        """Show the progress of the session.
 
         Args:
-            elapsed: [s].
-            seconds: that it should last [s].
+            elapsed: time since the start [s].
+            seconds: nominal duration [s].
         """
         self._bar.update(
             self._task,

@@ -1,4 +1,4 @@
-"""`trainer record`: the recorder alone, for a graph that somebody else has started."""
+"""`trainer record`: the recorder alone, for a graph that runs already."""
 
 import json
 import time
@@ -9,14 +9,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from session.demo import new_bag, not_run
-from session.domain import parse_domain
-from session.errors import SessionError
-from session.graph import RECORDER_NODE, node_environment, recorder_command
-from session.node_process import NodeCommand
-from session.processes import Event, Outcome, Supervisor
-from session.scene import load_scene
-from session.status import Status
+from cutting_trainer.session.demo import new_bag, report_failed_start
+from cutting_trainer.session.domain import parse_domain
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.graph import RECORDER_NODE, node_environment, recorder_command
+from cutting_trainer.session.node_process import NodeCommand
+from cutting_trainer.session.outcome import Outcome
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.status import Status
+from cutting_trainer.session.supervisor import Event, Supervisor
+from cutting_trainer.session.terminal import session_console
 
 _FOREVER = 1e9
 _COLUMNS = ('received', 'written', 'lost', 'unheard')
@@ -25,17 +27,17 @@ _COLUMNS = ('received', 'written', 'lost', 'unheard')
 def run_recorder(
     output: Path | None, scene: str, seed: int, domain: str, *, as_json: bool = False
 ) -> Status:
-    """Records until Ctrl-C and says what became of the messages, topic by topic.
+    """Record until Ctrl-C and print an account of the messages by topic.
 
     Args:
-        output: folder of the new bag; None: one named after scene and time.
-        scene: name or path of the scene that the nodes run; empty: not known.
-        seed: of the session.
-        domain: ROS domain; empty: of the environment.
+        output: folder of the new bag; None: a folder named after scene and time.
+        scene: name or path of the scene that the nodes run; empty: unknown.
+        seed: seed of the session.
+        domain: ROS domain; empty: that of the environment.
         as_json: print the account as JSON.
 
     Raises:
-        SessionError, SceneError: it cannot be recorded like this.
+        SessionError, SceneError: an option or the scene is not valid.
     """
     number = parse_domain(domain)
     if number == 'free':
@@ -44,11 +46,11 @@ def run_recorder(
         raise SessionError('--output names no folder: give the path of a new one')
     path = load_scene(scene).path if scene else None
     bag = new_bag(output, path.stem if path else RECORDER_NODE)
-    notes = Console(stderr=True, soft_wrap=True)
+    notes = session_console(soft_wrap=True)
     command = recorder_command(path, bag, seed, {'account_as_json': True})
     outcome, account = _run(command, bag, number, notes)
     if not outcome.ran:
-        return not_run(outcome, bag, notes)
+        return report_failed_start(outcome, bag, notes)
     if as_json:
         print(json.dumps(account, indent=2))
     elif account:
@@ -63,13 +65,13 @@ def run_recorder(
 def _run(
     command: NodeCommand, bag: Path, domain: int, notes: Console
 ) -> tuple[Outcome, dict[str, Any]]:
-    """How the recorder ended, and its account, empty where it could not give one."""
+    """Return the outcome of the recorder and its account, empty where there is none."""
     account: dict[str, Any] = {}
     began = time.monotonic()
 
     def tell(event: Event) -> None:
         if event.kind == 'message':
-            message = json.loads(event.text)
+            message = event.content
             account.update(message if 'bag' in message else {})
             account.setdefault('topics', {}).update({} if 'bag' in message else message)
         elif event.kind == 'ready':
@@ -91,11 +93,12 @@ def _run(
 
 
 def account_table(account: dict[str, Any]) -> Table:
-    """What became of the messages of each topic, and which topics were not recorded."""
+    """Return the counts of messages by topic, and the topics that were not recorded."""
     table = Table(title=f'{escape(account["bag"])}, {account["bytes"] / 1e6:.1f} MB')
     table.add_column('topic', overflow='fold')
     for word in _COLUMNS:
-        table.add_column('before it was heard' if word == 'unheard' else word, justify='right')
+        title = 'missed before subscription' if word == 'unheard' else word
+        table.add_column(title, justify='right')
     for topic, counts in account['topics'].items():
         table.add_row(escape(topic), *(str(counts[word]) for word in _COLUMNS))
     sums = [sum(counts[word] for counts in account['topics'].values()) for word in _COLUMNS]

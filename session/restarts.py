@@ -1,20 +1,20 @@
-"""When a node that died is started again: soon at first, later and later if it dies again."""
+"""Restart delays of a node that dies: exponential back-off."""
 
 from dataclasses import dataclass, field
 
-FIRST, MOST = 0.5, 30.0
-"""[s] after the first death, and at most."""
-HEALTHY = 10.0
-"""[s] that a node must have lived for its earlier deaths to be forgotten."""
+INITIAL_DELAY_S, MAX_DELAY_S = 0.5, 30.0
+"""Delay after the first death, and the longest delay [s]."""
+HEALTHY_AFTER_S = 10.0
+"""A node that has lived this long [s] starts at the first delay again."""
 
 
 @dataclass
 class Backoff:
-    """One node's deaths and what follows from them.
+    """Deaths of a node and its next start.
 
     Attributes:
-        deaths: in a row, none of which came after a healthy life.
-        due: when it is to be started again, on the caller's clock [s]; None: not at all.
+        deaths: number of deaths in a row, each after less than `HEALTHY_AFTER_S` seconds.
+        due: time of the next start on the caller's clock [s]; None: no start is due.
     """
 
     deaths: int = 0
@@ -22,18 +22,18 @@ class Backoff:
     _started: float = field(default=0.0)
 
     def started(self, now: float) -> None:
-        """Takes note of a start at a time [s]."""
+        """Register a start at a time [s]."""
         self._started, self.due = now, None
 
     def died(self, now: float) -> float:
-        """Takes note of a death at a time [s].
+        """Register a death at a time [s].
 
         Returns:
-            After how long [s] the node is to be started again.
+            Delay of the restart [s].
         """
-        if now - self._started > HEALTHY:
+        if now - self._started > HEALTHY_AFTER_S:
             self.deaths = 0
-        delay = min(FIRST * 2.0**self.deaths, MOST)
+        delay = min(INITIAL_DELAY_S * 2.0**self.deaths, MAX_DELAY_S)
         self.deaths += 1
         self.due = now + delay
         return delay

@@ -1,13 +1,13 @@
-"""The scene file as a whole, each section checked by the folder that it belongs to."""
+"""A whole scene file; the package of each section checks it."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import Field
 
-from cutting.settings import CuttingSettings
-from haptic_bridge.arm_settings import ArmSettings
-from haptic_bridge.settings import (
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
+from cutting_trainer.haptic_bridge.settings import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
@@ -15,10 +15,10 @@ from haptic_bridge.settings import (
     ToolSettings,
     check_together,
 )
-from session.errors import SessionError
-from tissue_sim.scene_file import SceneModel, nearest, read_section
-from tissue_sim.settings import TissueSettings
-from tissue_sim.share import share_folder
+from cutting_trainer.node_common.scene_file import SceneModel, nearest, read_section
+from cutting_trainer.node_common.share import share_folder
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.tissue_sim.settings import TissueSettings
 
 SCENES = share_folder() / 'config' / 'scenes'
 
@@ -37,10 +37,10 @@ class SessionSettings(SceneModel):
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that a scene file says.
+    """Content of a scene file.
 
     Attributes:
-        name: of the file, without its ending.
+        name: name of the file, without its extension.
         path: the file.
         profile: limits of the device that the scene names.
     """
@@ -58,14 +58,14 @@ class Scene:
 
 
 def load_scene(scene: str) -> Scene:
-    """Reads and checks a scene.
+    """Read and check a scene.
 
     Args:
-        scene: name of a file in config/scenes, without its ending, or the path of a scene file.
+        scene: name of a file in config/scenes, without its extension, or path of a scene file.
 
     Raises:
         SessionError: there is no such scene.
-        SceneError, SettingsError: the file says something that cannot be.
+        SceneError, SettingsError: a value of the file is not valid.
     """
     path = find_scene(scene)
     tool = read_section(path, 'tool', ToolSettings)
@@ -91,10 +91,10 @@ def load_scene(scene: str) -> Scene:
 
 
 def find_scene(scene: str, folder: Path = SCENES) -> Path:
-    """The file that a scene's name or path means.
+    """Return the file of a scene, given its name or path.
 
     Raises:
-        SessionError: there is none; names what there is.
+        SessionError: there is none; the message lists the known scenes.
     """
     if scene.endswith(('.yaml', '.yml')) or '/' in scene:
         return Path(scene).resolve()

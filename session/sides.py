@@ -5,32 +5,38 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
-
-from session.demo import conclude, expected_of, new_bag, not_run, run_nodes, script_seconds
-from session.domain import SIDES, reserved_domain
-from session.graph import bridge_side_nodes, sim_side_nodes
-from session.network import Network, network_environment
-from session.processes import Supervisor
-from session.progress import SessionProgress
-from session.scene import load_scene
-from session.status import Status
+from cutting_trainer.session.demo import (
+    conclude,
+    expectations,
+    new_bag,
+    report_failed_start,
+    run_nodes,
+    script_seconds,
+)
+from cutting_trainer.session.domain import SIDES, reserved_domain
+from cutting_trainer.session.graph import bridge_side_nodes, sim_side_nodes
+from cutting_trainer.session.network import Network, network_environment
+from cutting_trainer.session.progress import SessionProgress
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.status import Status
+from cutting_trainer.session.supervisor import Supervisor
+from cutting_trainer.session.terminal import session_console
 
 _FOREVER = 1e9
 
 
 @dataclass(frozen=True)
 class BridgeSide:
-    """What the command line says to the host with the device.
+    """Options of `bridge-side`, on the host with the device.
 
     Attributes:
         scene: name or path, the same on both hosts.
-        seconds: duration of the arm's script [s]; None: what the scene says.
-        bag: folder of the new bag; None: one named after scene and time.
-        seed: of everything random.
+        seconds: duration of the arm's script [s]; None: that of the scene.
+        bag: folder of the new bag; None: a folder named after scene and time.
+        seed: seed of all random numbers.
         domain: ROS domain.
-        network: how far the graph reaches.
-        arm: run the emulated arm; else a device's own driver is there.
+        network: reach of the graph.
+        arm: run the emulated arm; else the driver of a device runs.
         as_json: print the summary as JSON.
     """
 
@@ -45,22 +51,22 @@ class BridgeSide:
 
 
 def run_bridge_side(options: BridgeSide) -> Status:
-    """Runs the force loop and the recorder until the arm's script is over, or Ctrl-C.
+    """Run the force loop and the recorder until the end of the arm's script, or Ctrl-C.
 
     Raises:
-        SessionError, SceneError, SettingsError: it cannot be run like this.
+        SessionError, SceneError, SettingsError: an option or the scene is not valid.
     """
     scene = load_scene(options.scene)
     seconds = script_seconds(scene, options.seconds) if options.arm else _FOREVER
     bag = new_bag(options.bag, scene.name)
     nodes = bridge_side_nodes(scene.path, bag, options.seed, seconds, arm=options.arm)
-    notes = Console(stderr=True)
+    notes = session_console()
     with (
         reserved_domain(options.domain, SIDES[:1]) as domain,
         network_environment(domain, options.network) as environment,
     ):
         outcome = run_nodes(nodes, seconds, bag, environment, notes, restart=True)
-    return conclude(outcome, bag, expected_of(scene), as_json=options.as_json)
+    return conclude(outcome, bag, expectations(scene), as_json=options.as_json)
 
 
 def run_sim_side(
@@ -70,19 +76,19 @@ def run_sim_side(
     network: Network,
     mesh_bandwidth: float,
 ) -> Status:
-    """Computes the tissue until Ctrl-C.
+    """Compute the tissue until Ctrl-C.
 
     Args:
         scene: name or path, the same on both hosts.
-        seed: of everything random.
+        seed: seed of all random numbers.
         domain: ROS domain.
-        network: how far the graph reaches.
-        mesh_bandwidth: most that goes out for meshes [bytes/s]; 0: no limit.
+        network: reach of the graph.
+        mesh_bandwidth: limit of the outgoing mesh data [bytes/s]; 0: no limit.
 
     Raises:
-        SessionError, SceneError, SettingsError: it cannot be run like this.
+        SessionError, SceneError, SettingsError: an option or the scene is not valid.
     """
-    notes, path = Console(stderr=True), load_scene(scene).path
+    notes, path = session_console(), load_scene(scene).path
     with (
         reserved_domain(domain, SIDES[1:]) as number,
         network_environment(number, network) as environment,
@@ -92,7 +98,7 @@ def run_sim_side(
             sim_side_nodes(path, seed, Path(temporary) / 'tissue.checkpoint', mesh_bandwidth),
             Path(temporary) / 'log',
             environment,
-            progress.tell,
+            progress.show,
             restart=True,
         ) as supervisor,
     ):
@@ -100,5 +106,5 @@ def run_sim_side(
             supervisor.run(_FOREVER)
         outcome = supervisor.end()
         if not outcome.ran:
-            return not_run(outcome, Path(temporary), notes)
+            return report_failed_start(outcome, Path(temporary), notes)
     return Status.OK if outcome.interrupted and not outcome.deaths else Status.NODE_DIED

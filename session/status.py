@@ -4,7 +4,7 @@ import enum
 
 
 class Status(enum.IntEnum):
-    """What an exit status means; the sentences are those of the help."""
+    """Exit status; the help prints the meanings."""
 
     OK = 0
     FAILED = 1
@@ -14,10 +14,10 @@ class Status(enum.IntEnum):
 
     @property
     def meaning(self) -> str:
-        """In a few words."""
+        """Meaning in a few words."""
         return {
-            Status.OK: 'it did what it should',
-            Status.FAILED: 'it did not (the reasons are printed)',
+            Status.OK: 'success',
+            Status.FAILED: 'a check failed (the reasons are printed)',
             Status.BAD_INPUT: 'it cannot be done as asked',
             Status.NODE_DIED: 'a node died',
             Status.INTERRUPTED: 'it was interrupted',

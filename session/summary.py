@@ -1,4 +1,4 @@
-"""A session in numbers, from its bag alone."""
+"""Key figures of a session, from its bag alone."""
 
 import math
 import statistics
@@ -8,32 +8,32 @@ from typing import Any
 
 import numpy as np
 
-from session.evidence import Evidence, Status
+from cutting_trainer.session.evidence import Evidence, Status
 
-SETTLING = 1.0
-"""Not judged [s]: the time before every node has reported once, and this much after it."""
-LONGEST_STEP = 0.1
-"""A contact lasts no longer than this [s] past its last message."""
-FORCE_MARGIN = 0.02
-"""Contact and force of one tick are recorded this close to each other [s]."""
-RELEASE = 0.5
-"""Within it [s] the force must be zero after the last contact."""
+SETTLING_TIME_S = 1.0
+"""Rates count from so long [s] after the first report of the last node."""
+MAX_CONTACT_GAP_S = 0.1
+"""Longest time [s] that a contact counts past its last message."""
+FORCE_MARGIN_S = 0.02
+"""Contact and force of one tick are recorded within this time [s]."""
+RELEASE_TIME_S = 0.5
+"""The force must be zero this long [s] after the last contact."""
 
 
 @dataclass(frozen=True)
 class NodeSummary:
-    """One node over the settled part of the session; NaN where it does not say.
+    """Key figures of a node over the settled part of the session; NaN where it reports none.
 
     Attributes:
-        name: of the node.
-        rate, lowest_rate: median and least of its reports [Hz].
+        name: name of the node.
+        rate, lowest_rate: median and minimum of its reports [Hz].
         within, lowest_within: share of periods within half a period of the nominal one.
         period_p99, worst_period_p99: [s].
-        lateness_p999: worst of the reports [s].
-        longest_period: between two turns of its loop, from the beginning on [s].
-        missed: deadlines.
-        real_time: what it said about real-time scheduling, empty if nothing.
-        worst_level: of its statuses, 0 OK to 3 STALE.
+        lateness_p999: maximum of its reports [s].
+        longest_period: longest period of its loop, from the beginning on [s].
+        missed: number of missed deadlines.
+        real_time: its sentence about real-time scheduling, empty if none.
+        worst_level: worst level of its statuses, 0 OK to 3 STALE.
         message: sentence of its worst status.
     """
 
@@ -59,21 +59,21 @@ class NodeSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """A session.
+    """Key figures of a session.
 
     Attributes:
         bag: folder of the bag.
         complete: whether the bag was closed in order.
         duration: [s].
-        nodes: those that reported, by name.
-        contact_time: [s] in which the tool touched the tissue.
-        largest_force: commanded to the arm [N].
-        force_before_contact: largest [N] before the first contact.
-        force_after_contact: largest [N] from `RELEASE` after the last contact on; None if the bag
-            ends earlier.
-        elements_cut: as the tissue says.
-        messages: recorded.
-        lost, unheard: by topic, see `Evidence`.
+        nodes: nodes that reported, by name.
+        contact_time: time in which the tool touched the tissue [s].
+        largest_force: largest force commanded to the arm [N].
+        force_before_contact: largest force before the first contact [N].
+        force_after_contact: largest force [N] from `RELEASE_TIME_S` after the last contact on;
+            None if the bag ends earlier.
+        elements_cut: number of elements that the tissue reports as cut.
+        messages: number of recorded messages.
+        lost, unheard: counts by topic, see `Evidence`.
     """
 
     bag: str
@@ -90,18 +90,18 @@ class Summary:
     unheard: dict[str, int]
 
     def plain(self) -> dict[str, Any]:
-        """For JSON: NaN becomes None."""
+        """Return the figures for JSON: NaN becomes None."""
         plain: dict[str, Any] = _without_nan(asdict(self))
         return plain
 
 
 def summarise(evidence: Evidence) -> Summary:
-    """Computes the summary of a session."""
+    """Compute the summary of a session."""
     settled = _settled(evidence.statuses)
     names = sorted({status.node for status in evidence.statuses})
     contact = evidence.contacts[:, 1] > 0
     touched = evidence.contacts[contact, 0]
-    steps = np.minimum(np.diff(evidence.contacts[:, 0]), LONGEST_STEP)
+    steps = np.minimum(np.diff(evidence.contacts[:, 0]), MAX_CONTACT_GAP_S)
     return Summary(
         bag=str(evidence.bag),
         complete=evidence.complete,
@@ -110,10 +110,10 @@ def summarise(evidence: Evidence) -> Summary:
         contact_time=float(np.sum(steps, where=contact[:-1])),
         largest_force=_largest(evidence, -math.inf, math.inf) or 0.0,
         force_before_contact=_largest(
-            evidence, -math.inf, (touched[0] if len(touched) else math.inf) - FORCE_MARGIN
+            evidence, -math.inf, (touched[0] if len(touched) else math.inf) - FORCE_MARGIN_S
         )
         or 0.0,
-        force_after_contact=_largest(evidence, touched[-1] + RELEASE, math.inf)
+        force_after_contact=_largest(evidence, touched[-1] + RELEASE_TIME_S, math.inf)
         if len(touched)
         else None,
         elements_cut=_elements_cut(evidence.statuses),
@@ -124,11 +124,11 @@ def summarise(evidence: Evidence) -> Summary:
 
 
 def _settled(statuses: Iterable[Status]) -> float:
-    """When every node has reported, and `SETTLING` more [s]."""
+    """Return the time `SETTLING_TIME_S` after the first report of the last node [s]."""
     first: dict[str, float] = {}
     for status in statuses:
         first.setdefault(status.node, status.time)
-    return max(first.values(), default=0.0) + SETTLING
+    return max(first.values(), default=0.0) + SETTLING_TIME_S
 
 
 def _node(name: str, statuses: Iterable[Status], settled: float) -> NodeSummary:
@@ -159,7 +159,7 @@ def _node(name: str, statuses: Iterable[Status], settled: float) -> NodeSummary:
 
 
 def _largest(evidence: Evidence, start: float, end: float) -> float | None:
-    """The largest force [N] in an interval of time [s], None where there is no sample."""
+    """Return the largest force [N] in an interval of time [s], None where there is no sample."""
     times, norms = evidence.forces.T
     chosen = norms[(times >= start) & (times <= end)]
     return float(chosen.max()) if len(chosen) else None

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from haptic_bridge.arm import EmulatedArm
-from haptic_bridge.arm_settings import ArmSettings
-from haptic_bridge.hand import Hand, compile_script
-from haptic_bridge.settings import Transform
+from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
+from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
+from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
+from cutting_trainer.haptic_bridge.settings import Transform
 
 MS = 1_000_000
 LIMP = {'stiffness': 0.0, 'damping': 0.0}
@@ -35,7 +35,7 @@ def make_arm(*, seed=0, body_force=False, transform=None, **changes) -> Emulated
         'script': STAY,
     }
     arm = ArmSettings.model_validate(exact | changes)
-    hand = Hand(arm.hand, compile_script(arm.script, transform or Transform()), seed)
+    hand = EmulatedHand(arm.hand, compile_script(arm.script, transform or Transform()), seed)
     return EmulatedArm(arm, hand, body_force=body_force)
 
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from bags.metadata import read_metadata
-from bags.reader import Recorded, open_bag
-from bags.topics import POSE
-from bags.writer import BagWriter
-from haptic_bridge.wire import PoseStampedCodec
+from cutting_trainer.bags.metadata import read_metadata
+from cutting_trainer.bags.reader import Recorded, open_bag
+from cutting_trainer.bags.topics import POSE
+from cutting_trainer.bags.writer import BagWriter
+from cutting_trainer.node_common.cdr_codec import PoseStampedCodec
 
 
 def rewritten(

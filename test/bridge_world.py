@@ -25,17 +25,17 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import Log
 from rclpy.executors import SingleThreadedExecutor
 
-from haptic_bridge.operating_state import crtk_types
-from haptic_bridge.realtime import PRIORITY
-from haptic_bridge.wire import (
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
-    Sample,
+    StampedMessage,
     WrenchStampedCodec,
 )
-from tissue_sim import ros
-from tissue_sim.timing import request_real_time
+from cutting_trainer.node_common.operating_state import crtk_types
+from cutting_trainer.node_common.realtime import PRIORITY
+from cutting_trainer.node_common.timing import request_real_time
 
 ROOT = Path(__file__).resolve().parents[1]
 RADIUS = 0.004
@@ -55,8 +55,8 @@ def refused(status: dict[str, str]) -> int:
 class Record:
     """What happened, by the clock of this machine."""
 
-    wrenches: list[Sample] = field(default_factory=list)
-    contacts: list[Sample] = field(default_factory=list)
+    wrenches: list[StampedMessage] = field(default_factory=list)
+    contacts: list[StampedMessage] = field(default_factory=list)
     states: list[tuple[int, str]] = field(default_factory=list)
     statuses: list[dict[str, str]] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
@@ -238,7 +238,7 @@ def session(
     environment = os.environ | {'ROS_DOMAIN_ID': str(domain)}
     arguments = ['-p', f'scene:={scene}', '-p', 'auto_enable:=true']
     bridge = subprocess.Popen(
-        [sys.executable, '-m', 'haptic_bridge.node', '--ros-args', *arguments],
+        [sys.executable, '-m', 'cutting_trainer.haptic_bridge.node', '--ros-args', *arguments],
         cwd=ROOT,
         env=environment,
     )

@@ -1,100 +1,119 @@
-"""Tests against the clock are repeated where the machine failed (repetition.py), and run alone."""
+"""Which tests are run, one after the other or side by side, and what none may leave behind."""
 
+import contextlib
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import tempfile
+import time
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from repetition import SUITE, Run, judged, left_running
-from stand_still import Watch
 
-from session.graph import discovery
+from cutting_trainer.session.graph import discovery
 
 # How long an example takes is a matter of the machine, and of what it must compile first.
-settings.register_profile('trainer', deadline=None)
-settings.load_profile('trainer')
+settings.register_profile('all', deadline=None)
+settings.register_profile('usual', deadline=None, max_examples=30)
+settings.register_profile('quick', deadline=None, max_examples=10)
 
 STAND_INS = Path(__file__).with_name('stand_ins')
 PYTHON = f'python{sys.version_info.major}.{sys.version_info.minor}'
-RUN = pytest.StashKey['Run']()
 BUILT = pytest.StashKey[Path]()
+ALONE = {'alone', 'real_time'}
+LEFT_OUT = {'quick': {'long', 'thorough', *ALONE}, 'usual': {'thorough'}, 'all': set[str]()}
+"""Marks of the tests that a tier leaves out."""
+RUN = 'TRAINER_TEST_RUN'
+"""Variable by which the processes that a test starts are known."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds `--part`: `trainer test` runs the two parts one after the other."""
+    """Add `--part` and `--tier`: `trainer test` runs both parts of a tier, one after the other."""
     parser.addoption(
         '--part',
         choices=('beside', 'alone'),
         help='only tests that may run beside others, or only those that must not: '
-        'against the clock, over the network, with processes of their own',
+        'they measure the clock, or what a processor does',
+    )
+    parser.addoption(
+        '--tier',
+        choices=tuple(LEFT_OUT),
+        default='all',
+        help='without a graph and what is long; or without what is thorough; or all',
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Starts to watch the processors, and sees to it that an interrupt is one.
+    """See to it that an interrupt is one, and that nodes find each other as those of a session do.
 
-    Whoever starts the suite in the background of a shell script has it ignore SIGINT, and every
-    process that it starts with it. Nodes of the tests find others as those of a session do: with
-    shared memory, a process that is killed would stop those that talked to it, for seconds.
+    Whoever starts the tests in the background of a shell script has them ignore SIGINT, and every
+    process that they start with them. With shared memory, a process that is killed would stop
+    those that talked to it, for seconds.
     """
+    settings.load_profile(config.getoption('tier'))
     os.environ.update(discovery(os.environ))
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    folder = Path(tempfile.mkdtemp(prefix='stand-still-'))
-    config.stash[RUN] = Run(Watch(folder / 'seen'))
-    config.add_cleanup(lambda: shutil.rmtree(folder))
-    config.add_cleanup(config.stash[RUN].watch.end)
-    os.environ[SUITE] = str(os.getpid())
+    if not config.getoption('numprocesses', None):  # else each worker has its own
+        os.environ[RUN] = str(os.getpid())
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Chooses the part; puts the tests that look at what all others have made behind them."""
+    """Choose tier and part; put those that look at what all others have made behind them."""
     items.sort(key=lambda item: item.path.name == 'test_every_bag.py')
-    if part := config.getoption('part'):
-        others = [item for item in items if is_alone(item) != (part == 'alone')]
-        items[:] = [item for item in items if is_alone(item) == (part == 'alone')]
-        config.hook.pytest_deselected(items=others)
-
-
-def is_alone(item: pytest.Item) -> bool:
-    """Whether a test wants the machine for itself."""
-    return any(item.get_closest_marker(name) for name in ('alone', 'real_time'))
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Runs a test until it says something about the code."""
-    if not is_alone(item):
-        return None
-    run = item.config.stash[RUN]
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    if item.path != run.path:
-        run.path = item.path
-        run.watch.begin()
-    for report in judged(item, nextitem, run):
-        item.ihook.pytest_runtest_logreport(report=report)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    if nextitem is None or nextitem.path != item.path:
-        run.left += [f'{item.path.name}: {command}' for command in left_running()]
-    return True
+    left_out = LEFT_OUT[config.getoption('tier')]
+    part = config.getoption('part')
+    chosen, others = [], []
+    for item in items:
+        marks = {mark.name for mark in item.iter_markers()}
+        in_part = part is None or bool(marks & ALONE) == (part == 'alone')
+        (chosen if in_part and not marks & left_out else others).append(item)
+    items[:] = chosen
+    config.hook.pytest_deselected(items=others)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """A process that outlives its test is a fault: it takes the machine from the tests to come."""
-    if session.config.stash[RUN].left:
+    """Fail where a process outlives the tests: it takes the machine from those to come."""
+    deadline = time.monotonic() + 5.0
+    while (found := started_here()) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    for process, command in found.items():
+        print(f'left running: {command}', file=sys.stderr)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Says what was run more than once, what was not judged, and what was left running."""
-    for line in terminalreporter.config.stash[RUN].lines():
-        terminalreporter.write_line(line)
+def started_here() -> dict[int, str]:
+    """Return processes that have the mark of this one, but helpers of Python's; their commands."""
+    mark, found = f'{RUN}={os.getpid()}'.encode(), {}
+    for folder in Path('/proc').glob('[0-9]*'):
+        with contextlib.suppress(OSError):
+            if mark in (folder / 'environ').read_bytes().split(b'\0'):
+                command = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
+                if command and 'multiprocessing' not in command:
+                    found[int(folder.name)] = command
+    return found
+
+
+@pytest.fixture(autouse=True)
+def usual_priority() -> Iterator[None]:
+    """Fail a test that leaves a real-time priority to the tests after it, and take it away.
+
+    Two processes that are always busy inherited it, and no other got a turn: the tests never ended.
+    """
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    yield
+    after = os.sched_getscheduler(0), os.sched_getparam(0)
+    if after != before:
+        for thread in Path('/proc/self/task').iterdir():
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setscheduler(int(thread.name), *before)
+    assert after == before, 'the test changed how the test process is scheduled'
 
 
 @pytest.fixture

@@ -4,7 +4,8 @@ Arguments: NAME, LEDGER (a file that all fake nodes append to), and any of: mute
 deaf (ignores SIGINT and SIGTERM), done (says `done` soon), slow (ends 0.3 s after it was asked to),
 dies (exit status 7 before it is ready), refuses (the same with 2, as a node does whose scene is
 bad), asks (the launcher, and repeats its answer), falls (killed by a signal soon after it is
-ready), parent (starts a process of its own).
+ready), parent (starts a process of its own), garbles (says messages that nobody can read), beats
+(gives signs of life).
 """
 
 import os
@@ -41,8 +42,12 @@ def main(name: str, ledger: str, *habits: str) -> None:
     if 'mute' not in habits:
         print(f'ready: {name}')
     if 'asks' in habits:
-        print('message: may I?')
-        print(f'message: it was answered {sys.stdin.readline().strip()}')
+        print('message: {"ask": "may I?"}')
+        print(f'message: {{"answered": "{sys.stdin.readline().strip()}"}}')
+    if 'garbles' in habits:
+        print('message: {"ask": ')
+        print('message: [1]')
+        print('message: {"page": "' + 200_000 * 'x' + '"}')
     if 'done' in habits:
         time.sleep(0.5)
         print(f'done: {name}')
@@ -52,6 +57,8 @@ def main(name: str, ledger: str, *habits: str) -> None:
     print(f'[WARN] [1.0] [{name}]: careful')
     while not stopping:
         time.sleep(0.01)
+        if 'beats' in habits:
+            print(f'beat: {name}')
     if 'slow' in habits:
         time.sleep(0.3)
     note('end')

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from haptic_bridge.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
 
 HALF = 0.05
 POSITIONS = np.array([[-HALF, -HALF, 0], [HALF, -HALF, 0], [HALF, HALF, 0], [-HALF, HALF, 0]])

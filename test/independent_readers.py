@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from rosbags.highlevel import AnyReader
 
-from bags.reader import mcap_file, open_bag
+from cutting_trainer.bags.reader import mcap_file, open_bag
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / 'test' / 'mcap_core'

@@ -1,47 +1,89 @@
 """The bag of a session that this machine has just computed, with the sample's hand: no graph."""
 
 from pathlib import Path
+from typing import Any
 
 from cutting_trainer_msgs.msg import FrameInputs
 from rclpy.serialization import serialize_message
 
-from bags.metadata import read_metadata
-from bags.reader import open_bag
-from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, UPDATES
-from bags.writer import BagWriter
-from haptic_bridge.force_path import ForcePath
-from haptic_bridge.wire import ContactCodec, ForceSampleCodec, PoseStampedCodec
-from session.recordings.experiment import Hand, closed_loop
-from session.recordings.recorded_scene import restore_scene
-from session.recordings.resimulate import recomputation
-from session.scene import load_scene
-from tissue_sim.messages import DeltaEncoder, mesh_message
-from tissue_sim.ros import stamp
+from cutting_trainer.bags.message_text import schema_text
+from cutting_trainer.bags.metadata import FORMAT_VERSION, read_metadata
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.resimulation import Resimulation
+from cutting_trainer.bags.topics import CONTACT, FORCE, INPUTS, MEMORY, MESH, POSE, STATE, UPDATES
+from cutting_trainer.bags.writer import BagWriter
+from cutting_trainer.cutting.memory import MethodState
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec, PoseStampedCodec
+from cutting_trainer.node_common.code_identity import identity_here
+from cutting_trainer.node_common.ros import stamp
+from cutting_trainer.recordings.experiment import Hand, closed_loop
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate import recomputation
+from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.tissue_sim.contact.tool import Frame
+from cutting_trainer.tissue_sim.simulation.cut_transaction import ANSWER_FRAMES
+from cutting_trainer.tissue_sim.simulation.object_state import ObjectState
+from cutting_trainer.tissue_sim.simulation.state import state_of
+from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, mesh_message
+from cutting_trainer.tissue_sim.streaming.state_publisher import state_messages
 
 PERIOD = 50_000_000
 """[ns] of a frame."""
 KEYFRAME = 40
+STATE_TYPE = 'cutting_trainer_msgs/msg/State'
 
 
-def make_session(sample: Path, folder: Path, temporary: Path) -> Path:
+class Watched(Resimulation):
+    """A session that keeps its state, and that of cutting, at some frames.
+
+    Attributes:
+        every: frames from one to the next.
+        kept: by the number of the frame that begins from them.
+    """
+
+    every = 1
+    kept: dict[int, tuple[ObjectState, ObjectState]]
+
+    def frame(self, contact: Any) -> Frame:
+        step = self.simulation.step + 1
+        if step % self.every == 0 and not self.simulation.awaits_answer:
+            memory = MethodState(self._method, self._mesh).state()
+            self.kept[step] = (state_of(self.simulation), memory)
+        return super().frame(contact)
+
+
+def watched(scene: Scene, every: int) -> Watched:
+    """Simulation and cutting of a scene, before the first frame."""
+    computed = Watched(recomputation(scene).simulation, make_method(scene.cutting))
+    computed.every, computed.kept = every, {}
+    return computed
+
+
+def make_session(sample: Path, folder: Path, temporary: Path, every: int = 0) -> Path:
     """Writes the bag of a session: the hand of a sample, everything else computed now.
 
     Args:
         sample: bag of which scene and poses are taken.
         folder: of the new bag.
         temporary: for the scene.
+        every: frames from one whole state in the bag to the next; 0: it has none.
     """
     bag = open_bag(sample)
     scene = load_scene(str(restore_scene(bag, temporary)))
     codec = PoseStampedCodec()
     poses = [codec.decode(m.data) for m in bag.messages([POSE])]
     hand = Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))
-    computed = recomputation(scene)
+    computed = watched(scene, every) if every else recomputation(scene)
     simulation = computed.simulation
-    writer = BagWriter(folder, custom_data=read_metadata(sample)['custom_data'])
+    about = read_metadata(sample)['custom_data'] | {'format_version': str(FORMAT_VERSION)}
+    writer = BagWriter(folder, custom_data=about | identity_here().flat())
     for topic in (MESH, UPDATES, FORCE, INPUTS, CONTACT, POSE):
         kind = bag.topics()[topic]
         writer.add_topic(topic, kind, bag.schemas[kind], '', bag.profiles(topic))
+    for topic in (STATE, MEMORY) if every else ():
+        writer.add_topic(topic, STATE_TYPE, schema_text(STATE_TYPE), '', bag.profiles(FORCE))
     encoder = DeltaEncoder(simulation.mesh, simulation.displacement)
 
     def write(topic: str, time: int, data: bytes) -> None:
@@ -77,17 +119,24 @@ def make_session(sample: Path, folder: Path, temporary: Path) -> Path:
             contact_stamp=stamp(contact.stamp_ns),
             answer=answer,
             cut_step=cut_step if answer else 0,
+            answer_frames=ANSWER_FRAMES,
         )
         inputs.header.stamp = stamp(time)
         write(CONTACT, time, ContactCodec('tissue').encode(contact.stamp_ns, contact.values))
         write(INPUTS, time, serialize_message(inputs))
+        if isinstance(computed, Watched):
+            for topic, state in zip(
+                (STATE, MEMORY), computed.kept.pop(frame.step, ()), strict=False
+            ):
+                for part in state_messages(state, frame.step, time):
+                    write(topic, time, serialize_message(part))
         touched = computed.touched if answer == FrameInputs.APPLIED else None
         delta = encoder.encode(simulation.displacement, frame.step, time, touched, cut_step)
         assert hand.sample is not None
         write(FORCE, time, ForceSampleCodec('tissue').encode(time, hand.sample.values))
         if delta is not None:
             write(UPDATES, time, serialize_message(delta))
-        if frame.step % KEYFRAME == 0:
+        if frame.step % KEYFRAME == 0 or (every and frame.step % every == 0):
             keyframe(time)
         if frame.command is not None:
             cut_step = frame.step

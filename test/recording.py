@@ -14,7 +14,7 @@ from live import PATIENCE, ROOT
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from tissue_sim.ros import ARM
+from cutting_trainer.node_common.ros import ARM
 
 DOMAIN = 20 + os.getpid() % 80
 MEASURED_CP = f'{ARM}/measured_cp'
@@ -50,7 +50,7 @@ class RecorderProcess:
         self.folder = folder
         settings = [f'{key}:={value}' for key, value in ({'bag': folder} | parameters).items()]
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'bags.node', '--ros-args']
+            [sys.executable, '-m', 'cutting_trainer.bags.node', '--ros-args']
             + [word for setting in settings for word in ('-p', setting)],
             cwd=ROOT,
             env=os.environ | {'ROS_DOMAIN_ID': str(DOMAIN), 'PYTHONUNBUFFERED': '1'},

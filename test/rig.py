@@ -3,11 +3,16 @@
 import numpy as np
 from flat_tissue import flat_surface
 
-from haptic_bridge.chain import INSIDE, NONE, TOUCHING
-from haptic_bridge.force_path import ForcePath
-from haptic_bridge.operating_state import State
-from haptic_bridge.settings import DeviceProfile, DeviceSettings, HapticsSettings, ToolSettings
-from haptic_bridge.wire import ContactCodec, ForceSampleCodec, Sample
+from cutting_trainer.haptic_bridge.chain import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.settings import (
+    DeviceProfile,
+    DeviceSettings,
+    HapticsSettings,
+    ToolSettings,
+)
+from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec, StampedMessage
+from cutting_trainer.node_common.operating_state import CrtkState
 
 MS = 1_000_000
 FRAME = 33
@@ -25,7 +30,7 @@ class Rig:
         self.tool = tool or ToolSettings(radius=RADIUS, coupling_stiffness=200.0)
         self.path = ForcePath(self.tool, device or DeviceSettings(), haptics, profile)
         self.now, self.ms, self.step = 10**12, 0, 0
-        self.state = State.ENABLED
+        self.state = CrtkState.ENABLED
         self.surface = flat_surface(revision=0)
         self.sim = self.mesh = self.poses = True
         self.topology, self.inside, self.near = 1, False, False
@@ -43,7 +48,9 @@ class Rig:
     def tick(self, position, orientation=UNIT, stamp=None):
         self.now += MS
         self.ms += 1
-        pose = Sample(stamp or self.now, '', (*position, *orientation)) if self.poses else None
+        pose = (
+            StampedMessage(stamp or self.now, '', (*position, *orientation)) if self.poses else None
+        )
         sample = self._sample() if self.sim and self.ms % FRAME == 0 else None
         out = self.path.tick(
             self.now,
@@ -54,7 +61,7 @@ class Rig:
             surface=self.surface,
         )
         if out.fault:
-            self.state = State.FAULT
+            self.state = CrtkState.FAULT
         self.last_contact = out
         self.ticks.append(out)
         self.forces.append(out.wrench[:3])
@@ -78,10 +85,10 @@ class Rig:
         state = INSIDE if self.inside else state
         head = (self.step, self.step, self.topology, values[0], *stamp, state)
         stiffness = (*(0.0,) * 8, K if state != NONE or self.near else 0.0)
-        sample = Sample(
+        sample = StampedMessage(
             self.now,
             'tissue',
-            (*head, *device, 0.0, 0.0, K * depth, *stiffness, 0.3, 0.0, 0.0),
+            (*head, *device, 0.0, 0.0, K * depth, *stiffness, 0.3, 0.0, 0.0, 0),
         )
         return self.spoil(sample)
 

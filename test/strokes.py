@@ -4,12 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from cutting.checks import check_mesh, lips
-from cutting.method import CutResult
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from tissue_sim.blade import Sweep
-from tissue_sim.mesh import TetMesh
+from cutting_trainer.cutting.checks import check_mesh, cut_faces
+from cutting_trainer.cutting.method import CutResult
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 
 def method_named(name='combined', **settings):
@@ -25,7 +25,7 @@ def straight(begin, end, edge, steps):
 def draw(method, mesh, path, *, positions=None, finish=True) -> list[CutResult]:
     """Draws the blade along a path, shape (k, 2, 3), and checks the mesh after every batch."""
     volume = float(mesh.volumes().sum())
-    old = lips(mesh)
+    old = cut_faces(mesh)
     results = []
 
     def take(result):

@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 from meshes import box
 
-from tissue_sim.active_region import ActiveRegion, ActiveSettings
-from tissue_sim.coupling import PUSH, Coupling
-from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.elasticity import ElasticModel, ModelName
-from tissue_sim.integrators import IntegratorName
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, TopologyDelta
-from tissue_sim.rings import Neighbours
+from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
+from cutting_trainer.tissue_sim.mesh.adjacency import NodeAdjacency
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.motion.active_region import ActiveRegion, ActiveSettings
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+
+pytestmark = pytest.mark.long
 
 CELLS, SIZE = (16, 6, 3), 0.01
 
@@ -112,7 +114,7 @@ def test_neighbours_follow_cuts_as_if_they_were_found_anew() -> None:
     for _ in range(12):
         gone = random.choice(len(mesh.tetrahedra), 9, replace=False)
         model.update(mesh.apply(TopologyDelta(removed_tetrahedra=gone)))
-        anew = Neighbours(mesh)
+        anew = NodeAdjacency(mesh)
         for seed in random.choice(mesh.node_count, 5):
             for rings in (1, 2):
                 seeds = np.array([seed])

@@ -74,7 +74,7 @@ def test_nan_command_zeroes_the_motors_at_once(bad, axis):
     force[axis] = bad
     _, forces = run(arm, 10, force=tuple(force), start=50)
     assert_array_equal(forces, 0)
-    assert arm.refusals.total == 10
+    assert arm.rejections.total == 10
 
 
 def test_zero_stamp_marks_a_command_invalid():
@@ -93,7 +93,7 @@ def test_repeated_and_older_commands_neither_act_nor_feed_the_watchdog():
         arm.command(49 * MS, (2.0, 0, 0), tick * MS)
         arm.advance(tick * MS, enabled=True)
         assert arm.force[0] == 1.0
-    assert arm.refusals.total == 50
+    assert arm.rejections.total == 50
     run(arm, 5, start=75)
     assert_array_equal(arm.force, 0)
 

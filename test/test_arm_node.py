@@ -1,5 +1,6 @@
 """Claims about the running node `emulated_arm`, between a bridge and a CRTK client played here."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +19,17 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from numpy.testing import assert_allclose, assert_array_equal
 
-from haptic_bridge.operating_state import crtk_types
-from haptic_bridge.realtime import PRIORITY
-from haptic_bridge.wire import (
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.cdr_codec import (
     PoseStampedCodec,
-    Sample,
     StampedCodec,
+    StampedMessage,
     TwistStampedCodec,
     WrenchStampedCodec,
 )
-from tissue_sim import ros
-from tissue_sim.timing import request_real_time
+from cutting_trainer.node_common.operating_state import crtk_types
+from cutting_trainer.node_common.realtime import PRIORITY
+from cutting_trainer.node_common.timing import request_real_time
 
 pytestmark = pytest.mark.real_time
 
@@ -57,9 +59,9 @@ arm:
 class Record:
     """What the arm did, by the clock of this machine."""
 
-    poses: list[Sample] = field(default_factory=list)
-    twists: list[Sample] = field(default_factory=list)
-    wrenches: list[Sample] = field(default_factory=list)
+    poses: list[StampedMessage] = field(default_factory=list)
+    twists: list[StampedMessage] = field(default_factory=list)
+    wrenches: list[StampedMessage] = field(default_factory=list)
     states: list[str] = field(default_factory=list)
     statuses: list[dict[str, str]] = field(default_factory=list)
     answers: dict[str, Any] = field(default_factory=dict)
@@ -72,7 +74,7 @@ class Record:
         self.marks[name] = time.time_ns()
 
     def between(
-        self, samples: list[Sample], after: str, before: str = '', delay: float = 0.0
+        self, samples: list[StampedMessage], after: str, before: str = '', delay: float = 0.0
     ) -> np.ndarray:
         """Values stamped from `delay` [s] after one mark up to another, shape (n, 3)."""
         start = self.marks[after] + delay * 1e9
@@ -233,7 +235,7 @@ def record(tmp_path_factory):
     """The session; again where this test, as the bridge, was itself kept from running."""
     for _ in range(3):
         recorded = session(tmp_path_factory.mktemp('arm') / 'arm.yaml')
-        if recorded.longest_gap < WATCHDOG / 2:
+        if recorded.longest_gap < 0.8 * WATCHDOG:
             return recorded
     return pytest.fail(f'this machine held the bridge up for {recorded.longest_gap:.3f} s')
 
@@ -244,7 +246,12 @@ def session(scene: Path) -> Record:
     record = Record()
     arm = subprocess.Popen(
         [
-            *(sys.executable, '-m', 'haptic_bridge.arm_node', '--ros-args'),
+            *(
+                sys.executable,
+                '-m',
+                'cutting_trainer.haptic_bridge.emulated_arm.node',
+                '--ros-args',
+            ),
             *('-p', f'scene:={scene}', '-p', 'seconds:=1.0'),
         ],
         cwd=ROOT,
@@ -285,9 +292,19 @@ def test_arm_streams_pose_velocity_and_force_with_rising_stamps_in_its_frame(rec
 
 
 def test_velocity_is_the_derivative_of_position(record):
-    poses = record.between(record.poses, 'bridge enabled', 'script over')
-    twists = record.between(record.twists, 'bridge enabled', 'script over')
-    assert_allclose(twists.sum(axis=0) * 1e-3, poses[-1] - poses[0], atol=2e-3)
+    """From one tick to the next, by their stamps: after a late one the arm makes up for it."""
+    start, end = record.marks['bridge enabled'], record.marks['script over']
+    twists = {s.stamp_ns: s.values[:3] for s in record.twists}
+    poses = [s for s in record.poses if start <= s.stamp_ns < end and s.stamp_ns in twists]
+    in_time = [
+        (before, after)
+        for before, after in itertools.pairwise(poses)
+        if 0.5e6 < after.stamp_ns - before.stamp_ns < 1.5e6
+    ]
+    moved = sum(np.subtract(after.values[:3], before.values[:3]) for before, after in in_time)
+    expected = sum(1e-3 * np.array(twists[after.stamp_ns]) for _, after in in_time)
+    assert np.linalg.norm(expected) > 0.1 * np.linalg.norm(np.subtract(END, START))
+    assert_allclose(moved, expected, atol=1e-3)
 
 
 def test_hand_waits_at_the_start_until_the_bridge_is_enabled_and_commands(record):
@@ -357,7 +374,7 @@ def test_two_bridges_that_command_at_once_are_a_fault_without_force(record):
 
 def test_operating_state_is_latched_published_on_event_and_answered(record):
     expected = ['ENABLED', 'PAUSED', 'ENABLED', 'DISABLED', 'ENABLED', 'FAULT', 'ENABLED']
-    assert record.states == expected
+    assert [state for state, _ in groupby(record.states)] == expected  # commands repeat it
     first, paused = record.answers['at first'], record.answers['paused']
     assert (first.state, first.is_homed, first.is_busy) == ('ENABLED', True, False)
     assert paused.state == 'PAUSED'
@@ -383,7 +400,14 @@ def test_arm_without_a_usable_scene_ends_with_a_sentence(tmp_path):
     scene = tmp_path / 'bad.yaml'
     scene.write_text('arm: {mass: 0.1}\n')
     ended = subprocess.run(
-        [sys.executable, '-m', 'haptic_bridge.arm_node', '--ros-args', '-p', f'scene:={scene}'],
+        [
+            sys.executable,
+            '-m',
+            'cutting_trainer.haptic_bridge.emulated_arm.node',
+            '--ros-args',
+            '-p',
+            f'scene:={scene}',
+        ],
         cwd=ROOT,
         env=os.environ | {'ROS_DOMAIN_ID': str(DOMAIN)},
         capture_output=True,

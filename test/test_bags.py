@@ -17,14 +17,14 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bags.errors import BagError
-from bags.message_text import schema_text
-from bags.metadata import FORMAT_VERSION, read_metadata
-from bags.qos import INFINITE, OfferedQos, channel_profiles, metadata_profiles
-from bags.reader import Recorded, open_bag
-from bags.repair import repair_bag
-from bags.sequences import SequenceCounter
-from bags.writer import BagWriter
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.message_text import schema_text
+from cutting_trainer.bags.metadata import FORMAT_VERSION, read_metadata
+from cutting_trainer.bags.qos import INFINITE, OfferedQos, channel_profiles, metadata_profiles
+from cutting_trainer.bags.reader import Recorded, open_bag
+from cutting_trainer.bags.repair import repair_bag
+from cutting_trainer.bags.sequences import SequenceCounter
+from cutting_trainer.bags.writer import BagWriter
 
 SAMPLES = Path(__file__).resolve().parents[1] / 'bags' / 'samples' / 'format_2'
 
@@ -347,8 +347,8 @@ def test_a_damaged_byte_in_a_bag_with_an_end_is_found_and_named(folder: Path) ->
     path.write_bytes(data)
     with pytest.raises(BagError, match=r'is damaged .* repair'):
         list(open_bag(folder).messages())
-    assert repair_bag(folder).damaged == 1
-    assert len(list(open_bag(folder).messages())) == 450
+    assert repair_bag(folder).doubtful == 50
+    assert len(list(open_bag(folder).messages())) == 500
 
 
 def installed_types() -> list[str]:

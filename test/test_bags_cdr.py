@@ -11,9 +11,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import serialize_message
 from service_msgs.msg import ServiceEventInfo
 
-from bags.cdr import Decoder
-from bags.errors import BagError
-from bags.message_text import schema_text
+from cutting_trainer.bags.cdr import Decoder
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.message_text import schema_text
 
 SOURCE = random.Random(3)
 

@@ -4,7 +4,7 @@ import itertools
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,11 @@ from rclpy.serialization import serialize_message
 from recording import MEASURED_CP, RecorderProcess, source
 from std_msgs.msg import Header
 
-from bags.reader import open_bag
-from bags.repair import repair_bag
-from tissue_sim.ros import CONTACT, MESH_UPDATES, UPDATES
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.repair import repair_bag
+from cutting_trainer.node_common.ros import CONTACT, MESH_UPDATES, UPDATES
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
 
 @pytest.fixture
@@ -103,6 +103,12 @@ def kill_while_it_records(folder: Path, delay: float) -> int:
         recorder.process.communicate()
 
 
+def as_sent(data: bytes, lengths: list[int], sent: Container[bytes]) -> bytes:
+    """A message without the up to three bytes by which RTPS fills its last word."""
+    shorter = (data[:length] for length in lengths if length <= len(data) < length + 4)
+    return next((some for some in shorter if some in sent), data)
+
+
 def test_a_recorder_killed_twenty_times_leaves_all_but_the_last_half_second_bit_for_bit(
     node: Node, tmp_path: Path
 ) -> None:
@@ -125,7 +131,8 @@ def test_a_recorder_killed_twenty_times_leaves_all_but_the_last_half_second_bit_
             kept = [m.data for m in bag.messages([topic])]
             # A process that waits for a processor may lose some on the way: counted elsewhere.
             place = {data: i for i, data in enumerate(all_sent)}
-            places = [place[data] for data in kept]
+            lengths = sorted({len(data) for data in all_sent})
+            places = [place[as_sent(data, lengths, place)] for data in kept]
             assert places == sorted(set(places))
             missing = times[places[-1] + 1 :]
             assert not missing or missing[0] > end - 5e8

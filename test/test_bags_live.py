@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 import yaml
-from cutting_trainer_msgs.msg import Contact, MeshDelta
+from cutting_trainer_msgs.msg import Contact, FrameInputs, MeshDelta, State
 from geometry_msgs.msg import PoseStamped
 from live import PATIENCE, ROOT, wait_for
 from rclpy.node import Node
@@ -29,11 +29,19 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from bags.node import Recorder
-from bags.reader import open_bag
-from bags.repair import repair_bag
-from session.scene import find_scene
-from tissue_sim.ros import CONTACT, LATCHED, MESH_UPDATES, STREAM, UPDATES
+from cutting_trainer.bags.node import Recorder
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.repair import repair_bag
+from cutting_trainer.node_common.ros import (
+    CONTACT,
+    FRAME_INPUTS,
+    LATCHED,
+    MESH_UPDATES,
+    STREAM,
+    TISSUE_STATE,
+    UPDATES,
+)
+from cutting_trainer.session.scene import find_scene
 
 pytestmark = pytest.mark.real_time
 
@@ -174,6 +182,19 @@ def test_a_best_effort_publisher_is_recorded_with_the_qos_it_offers(
         assert connection.msgcount == 1
 
 
+def test_a_state_is_asked_for_only_where_the_inputs_of_frames_arrive(
+    node: Node, recorder: RecorderProcess
+) -> None:
+    state = node.create_publisher(State, TISSUE_STATE, STREAM)
+    frames = heard(node, FrameInputs, FRAME_INPUTS, STREAM)
+    contacts = heard(node, Contact, CONTACT, STREAM)
+    frames.publish(FrameInputs())
+    time.sleep(1.0)
+    assert state.get_subscription_count() == 0
+    contacts.publish(Contact())
+    wait_for(lambda: state.get_subscription_count() == 1, 'the recorder to ask for the state')
+
+
 def test_service_calls_are_recorded_where_introspection_is_on(
     node: Node, recorder: RecorderProcess
 ) -> None:
@@ -209,7 +230,7 @@ def test_what_a_publisher_sent_before_the_recorder_heard_it_is_said(
     time.sleep(0.2)
     publisher.publish(String(data='heard'))
     time.sleep(0.3)
-    assert '/early: 1 received, 1 written, 0 lost, 3 sent before' in recorder.end()
+    assert '/early: 1 received, 1 written, 0 lost, 3 missed before subscription' in recorder.end()
 
 
 def test_losses_are_on_diagnostics_and_they_and_all_parameters_are_in_the_bag(
@@ -236,7 +257,7 @@ def test_record_says_of_each_topic_what_came_was_written_was_lost_and_was_sent_b
     early.publish(String(data='before'))
     early.publish(String(data='the newest is heard'))
     bag = tmp_path / 'bag'
-    command = [sys.executable, '-m', 'session.cli', 'record', '-o', str(bag), '--json']
+    command = [sys.executable, '-m', 'cutting_trainer.cli', 'record', '-o', str(bag), '--json']
     recording = subprocess.Popen(
         [*command, '--domain', str(DOMAIN), '--scene', 'block', '--seed', '7'],
         cwd=ROOT,
@@ -300,7 +321,7 @@ def test_a_recorder_that_cannot_work_says_why_and_ends(
 ) -> None:
     words = [('-p', f'{key}:={value or repr(value)}') for key, value in parameters.items()]
     ended = subprocess.run(
-        [sys.executable, '-m', 'bags.node', '--ros-args', *itertools.chain(*words)],
+        [sys.executable, '-m', 'cutting_trainer.bags.node', '--ros-args', *itertools.chain(*words)],
         cwd=tmp_path,
         env=os.environ | {'PYTHONPATH': f'{ROOT}{os.pathsep}{os.environ.get("PYTHONPATH", "")}'},
         capture_output=True,

@@ -1,5 +1,6 @@
 """A bag that was cut off or damaged becomes whole again, with all that can be read in it."""
 
+import json
 import os
 import resource
 from pathlib import Path
@@ -8,12 +9,14 @@ import pytest
 from independent_readers import by_rosbags
 from test_bags import add_topics, some_messages, write_all
 
-from bags.errors import BagError
-from bags.metadata import read_metadata
-from bags.reader import open_bag
-from bags.repair import repair_bag
-from bags.writer import BagWriter
-from session.recordings.repair import told
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.metadata import read_metadata
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.repair import repair_bag, repair_note
+from cutting_trainer.bags.writer import BagWriter
+from cutting_trainer.recordings.repair import account_lines, repair
+
+pytestmark = pytest.mark.long
 
 MESSAGES = some_messages(500)
 
@@ -47,12 +50,12 @@ def test_a_bag_cut_off_is_whole_again_with_its_complete_chunks_for_every_reader(
     result = repair_bag(folder)
     bag = open_bag(folder)
     kept = list(bag.messages())
-    assert bag.complete and bag.custom_data == {'seed': '7'}
+    assert bag.complete and bag.custom_data['seed'] == '7'
     assert 200 < len(kept) == result.messages < 500
     assert kept == MESSAGES[: len(kept)]
     assert by_rosbags(folder) == [(m.topic, m.type, m.log_time, m.data) for m in kept]
     assert read_metadata(folder)['message_count'] == len(kept)
-    assert result.cut_off > 0 and str(result.cut_off) in told(folder, result)[1]
+    assert result.cut_off > 0 and str(result.cut_off) in '\n'.join(account_lines(folder, result))
     assert sorted(path.name for path in folder.iterdir()) == ['metadata.yaml', 'session_0.mcap']
     assert repair_bag(folder).whole
 
@@ -64,17 +67,37 @@ def test_qos_and_hashes_survive_a_repair(folder: Path) -> None:
     assert read_metadata(folder)['topics_with_message_count'] == before
 
 
-def test_a_damaged_chunk_in_the_middle_costs_its_own_messages_only(folder: Path) -> None:
+def test_a_damaged_chunk_in_the_middle_is_kept_as_far_as_it_unpacks_and_named_as_doubtful(
+    folder: Path,
+) -> None:
     path = folder / 'session_0.mcap'
     data = bytearray(path.read_bytes())
     for i in range(len(data) // 2, len(data) // 2 + 64):
         data[i] ^= 0xFF
     path.write_bytes(bytes(data[:-20]))
     result = repair_bag(folder)
-    assert result.damaged == 1
+    assert result.doubtful == 50 and result.lost == 0
+    kept = list(open_bag(folder).messages())
+    assert len(kept) == 500 and sum(m in kept for m in MESSAGES) >= 450
+    assert any('50 messages' in line for line in account_lines(folder, result))
+    again = repair_bag(folder)
+    assert again.whole and 'to be doubted: 50 messages' in account_lines(folder, again)[1]
+    assert 'doubted: 50 messages' in repair_note(open_bag(folder).custom_data)
+
+
+def test_a_chunk_that_cannot_be_unpacked_costs_its_own_messages_only(folder: Path) -> None:
+    path = folder / 'session_0.mcap'
+    data = bytearray(path.read_bytes())
+    at = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2)
+    data[at : at + 4] = b'----'
+    path.write_bytes(bytes(data))
+    result = repair_bag(folder)
+    assert result.damaged == 1 and result.doubtful == 0 and result.lost == 50
+    assert len(result.lost_spans) == 1
     kept = list(open_bag(folder).messages())
     assert len(kept) == 450
     assert [m for m in MESSAGES if m in kept] == kept
+    assert any('50 messages' in line for line in account_lines(folder, result))
 
 
 def test_a_bag_of_which_nothing_can_be_saved_stays_as_it_was(folder: Path) -> None:
@@ -102,3 +125,16 @@ def test_where_there_is_no_room_the_bag_stays_as_it_was(folder: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before
     assert sorted(p.name for p in folder.iterdir()) == ['metadata.yaml', 'session_0.mcap']
+
+
+def test_json_counts_what_is_lost_and_names_it_by_topic_beside(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / 'session_0.mcap'
+    data = bytearray(path.read_bytes())
+    at = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2)
+    data[at : at + 4] = b'----'
+    path.write_bytes(bytes(data))
+    repair(folder, as_json=True)
+    plain = json.loads(capsys.readouterr().out)
+    assert plain['lost'] == 50 == sum(plain['lost_by_sequence'].values())

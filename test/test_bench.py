@@ -1,4 +1,4 @@
-"""Claims about what `bench` prints: sound figures of every benchmark, at any size."""
+"""Claims about what `bench speed` prints: sound figures of every benchmark, at any size."""
 
 import json
 import math
@@ -9,36 +9,42 @@ import numpy as np
 import pytest
 from meshes import box as block
 
-from session.errors import SessionError
-from session.measure import bench
-from session.measure.bench_flow import session
-from session.measure.bench_frame import frame
-from session.measure.bench_proxy import proxy
-from session.measure.bench_scaling import line, measure
-from session.measure.bench_tissue import box, moved_bytes
-from session.options import Bench
-from tissue_sim.elasticity import ElasticModel
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
+from bench.speed import command as bench
+from bench.speed.flow import session
+from bench.speed.frame import frame
+from bench.speed.parts import Part
+from bench.speed.proxy import proxy
+from bench.speed.scaling import line, measure
+from bench.speed.tissue import box, moved_bytes
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope='module', autouse=True)
 def _short() -> None:
     bench.BENCHES = bench.BENCHES | {
-        Bench.FRAME: (lambda sizes: frame(sizes, frames=40), [300]),
-        Bench.PROXY: (lambda: proxy(repeats=1, ticks=50), []),
-        Bench.SESSION: (lambda sizes: session(sizes, seconds=0.2), [300]),
-        Bench.START: (lambda: bench.start(repeats=1), []),
+        Part.FRAME: (lambda sizes: frame(sizes, frames=40), [300]),
+        Part.PROXY: (lambda: proxy(repeats=1, ticks=50), []),
+        Part.SESSION: (lambda sizes: session(sizes, seconds=0.2), [300]),
+        Part.START: (lambda: bench.start(repeats=1), []),
     }
 
 
-@pytest.mark.parametrize('name', list(Bench))
+@pytest.mark.parametrize(
+    'name',
+    [
+        pytest.param(name, marks=pytest.mark.thorough) if name == Part.START else name
+        for name in Part
+    ],
+)
 def test_each_benchmark_gives_sound_figures_as_json(
-    name: Bench, capsys: pytest.CaptureFixture[str]
+    name: Part, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sizes = [] if name in (Bench.PROXY, Bench.START) else [300]
+    sizes = [] if name in (Part.PROXY, Part.START) else [300]
     bench.run_bench([name], sizes, as_json=True, save=False)
     report: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert list(report['figures']) == ['memory', name.value]
@@ -51,13 +57,13 @@ def test_each_benchmark_gives_sound_figures_as_json(
 
 def test_a_size_for_a_benchmark_that_has_none_is_refused() -> None:
     with pytest.raises(SessionError, match='has no size'):
-        bench.run_bench([Bench.START], [300], as_json=True, save=False)
+        bench.run_bench([Part.START], [300], as_json=True, save=False)
 
 
 def test_an_earlier_run_stands_beside_a_new_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    names, file = [Bench.CUT], tmp_path / 'then.json'
+    names, file = [Part.CUT], tmp_path / 'then.json'
     bench.run_bench(names, [300], as_json=True, save=False)
     then = json.loads(capsys.readouterr().out)
     row = then['figures']['cut'][0]
@@ -81,8 +87,8 @@ def test_a_file_that_is_no_earlier_run_is_refused_before_anything_is_measured(
 ) -> None:
     file = tmp_path / 'rows.json'
     file.write_text(words)
-    with pytest.raises(SessionError, match=f'rows.json is not of a run of bench: {wrong}'):
-        bench.run_bench([Bench.START], [], as_json=True, save=True, against=file)
+    with pytest.raises(SessionError, match=f'rows.json is not of a run of bench speed: {wrong}'):
+        bench.run_bench([Part.START], [], as_json=True, save=True, against=file)
 
 
 def test_a_box_has_about_as_many_tetrahedra_as_it_is_asked_for() -> None:

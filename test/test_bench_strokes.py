@@ -2,12 +2,19 @@
 
 import numpy as np
 import pytest
+from numba import njit
 
-from session.measure.bench_strokes import Session, array_bytes, measure
-from session.measure.strokes_report import LIMIT, Row, ratios
-from tissue_sim.domains import Domains, NodeDomains, add_still_domains
-from tissue_sim.mesh import TetMesh
-from tissue_sim.tensor_mass import TensorMass, Tensors, packed, put_rows
+from bench.speed.strokes import Session, array_bytes, measure
+from bench.speed.strokes_report import MAX_RATIO, Row, ratios
+from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import (
+    NodalSmoothing,
+    SmoothingDomains,
+    add_linear_smoothed_forces,
+)
+from cutting_trainer.tissue_sim.elasticity.tensor_mass import TensorMass, Tensors, packed, put_rows
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+
+pytestmark = pytest.mark.long
 
 STROKES = 30
 
@@ -25,12 +32,12 @@ def test_many_strokes_leave_a_sound_mesh_and_memory_in_proportion(
     session, rows = cut
     first, last = rows[0], rows[-1]
     assert [row.strokes for row in rows] == [0, 10, 20, 30]
-    assert session.simulation.elements_cut > 3 * STROKES
+    assert session.simulation.elements_cut > 2 * STROKES
     assert last.tetrahedra > 1.2 * first.tetrahedra
     assert last.substeps <= 1.3 * first.substeps  # growth of 1.1, and the tool on lighter nodes
     _, memory = ratios(rows)
     print(f'{last.tetrahedra} tetrahedra, {last.loose} loose, memory by element {memory:.2f}')
-    assert memory <= LIMIT
+    assert memory <= MAX_RATIO
 
 
 def test_slots_are_bounded_by_what_lives_in_them(cut: tuple[Session, list[Row]]) -> None:
@@ -59,10 +66,12 @@ def test_packing_changes_no_force(cut: tuple[Session, list[Row]]) -> None:
     mesh = cut[0].simulation.mesh
     n = mesh.node_count
     u = np.random.default_rng(0).standard_normal(3 * n)
-    for values in (cut[0].simulation.model.tensor_mass, NodeDomains(mesh, 1.0, 1.0)):
+    for values in (cut[0].simulation.model.tensor_mass, NodalSmoothing(mesh, 1.0, 1.0)):
         assert values is not None
         before = product(values, mesh, u)
-        t: Tensors | Domains = values.tensors if isinstance(values, TensorMass) else values._domains
+        t: Tensors | SmoothingDomains = (
+            values.tensors if isinstance(values, TensorMass) else values._domains
+        )
         name = 'blocks' if isinstance(t, Tensors) else 'vectors'
         far = np.array([10**9])
         columns, numbers = packed(t.start, t.used, t.room, n, t.columns, getattr(t, name), far)
@@ -77,10 +86,10 @@ def test_packing_changes_no_force(cut: tuple[Session, list[Row]]) -> None:
         np.testing.assert_array_equal(product(values, mesh, u), before)
 
 
-def product(values: TensorMass | NodeDomains, mesh: TetMesh, u: np.ndarray) -> np.ndarray:
+def product(values: TensorMass | NodalSmoothing, mesh: TetMesh, u: np.ndarray) -> np.ndarray:
     f, whole = np.zeros_like(u), np.array([[0, mesh.node_count]])
-    add = put_rows if isinstance(values, TensorMass) else add_still_domains
-    add(values.operands, whole, u, f)
+    add = put_rows if isinstance(values, TensorMass) else add_linear_smoothed_forces
+    njit(add)(values.operands, whole, u, f)
     return f
 
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from bridge_world import DEPTH, PRESSED, SCHEDULING, K, Record, World, refused, session
 
-from haptic_bridge.chain import NONE
-from haptic_bridge.settings import DeviceSettings
-from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
-from tissue_sim import ros
+from cutting_trainer.haptic_bridge.chain import NONE
+from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec
 
 pytestmark = pytest.mark.real_time
 
@@ -36,9 +36,10 @@ LATE = 50 * 10**6
 WAITED = 300 * 10**6
 """[ns]"""
 STALE, FADE = 0.1, 0.05
-BACK = 0.5
-"""[s] after which a force that was let in again is whole."""
 FELT = K * DEPTH
+HEARD = 400
+"""Forces in a fault that are enough to judge it by: 0.4 s of a bridge with all its turns."""
+MAX_TRIES = 20
 POSES = {
     'nan': 'not finite',
     'jump': 'jumped',
@@ -72,6 +73,7 @@ class FaultyWorld(World):
         super().__init__(record)
         self.place = (0.01, -0.01)
         self.second = None
+        self.refusable = 0
 
     def send_pose(self, now: int, tick: int) -> None:
         now += self.clock
@@ -92,8 +94,10 @@ class FaultyWorld(World):
             end.publish(data)
         if self.fault == 'duplicated':
             self.pose.publish(data)
+            self.refusable += 1
         elif self.fault == 'reordered' and tick % 2:
             self.pose.publish(self.encoded_pose(now - LATE, self.height - 1e-3))
+            self.refusable += 1
 
     def send_frame(self) -> None:
         if self.fault == 'reordered':
@@ -152,7 +156,7 @@ class FaultyWorld(World):
                 self.command.publish(self.message(string='enable'))
             time.sleep(0.01)
         self.move(PRESSED, 0.2)
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while not self.is_steady():
             if again and self.record.states[-1][1] == 'FAULT':
                 self.lift()
@@ -169,6 +173,18 @@ class FaultyWorld(World):
 
     def lift(self) -> None:
         self.move(0.02, 0.05)
+
+    def stale_trips(self) -> int:
+        """How often frames were overdue, by the bridge's next status that it begins from now on."""
+        told = len(self.record.statuses) + 2
+        self.wait_until(lambda: len(self.record.statuses) >= told, 30.0)
+        return int(float(self.record.statuses[-1]['stale_trips']))
+
+    def feel(self, seconds: float) -> None:
+        """Waits so long, and until enough forces have come to judge by."""
+        before = len(self.record.wrenches)
+        time.sleep(seconds)
+        self.wait_until(lambda: len(self.record.wrenches) >= before + HEARD, 30.0)
 
 
 def play(world: FaultyWorld, record: Record) -> None:
@@ -225,9 +241,18 @@ def play(world: FaultyWorld, record: Record) -> None:
         end(fault)
         world.node.destroy_publisher(world.second)
         time.sleep(1.2)  # as long as the bridge remembers it
-    for fault, seconds in (('duplicated', 0.5), ('reordered', 0.5), ('waited', 0.6), ('hole', 0.5)):
+    for fault in ('duplicated', 'reordered'):
+        for _ in range(MAX_TRIES):
+            trips = world.stale_trips()
+            begin(fault)
+            world.feel(0.5)
+            end(fault)
+            if world.stale_trips() == trips:
+                break
+    record.marks['refusable'] = world.refusable
+    for fault, seconds in (('waited', 0.6), ('hole', 0.5)):
         begin(fault)
-        time.sleep(seconds)
+        world.feel(seconds)
         end(fault)
         if fault == 'hole':
             world.lift()
@@ -303,35 +328,24 @@ def test_enable_is_refused_while_the_cause_is_there(record, fault):
     assert record.marks[f'{fault} refused']
 
 
-def overdue(record, stamps):
-    """When, of some stamps [ns], this test had no turn to send a frame, or the force came back."""
-    frames = np.array(record.frames)
-    held = np.zeros(len(stamps), bool)
-    for gap in np.flatnonzero(np.diff(frames) > STALE / 2 * 1e9):
-        end = frames[gap + 1] + BACK * 1e9
-        held |= (stamps > frames[gap] + STALE / 2 * 1e9) & (stamps < end)
-    return held
-
-
 @pytest.mark.parametrize('fault', ['duplicated', 'reordered'])
 def test_messages_that_come_twice_or_in_the_wrong_order_are_not_felt(record, fault):
-    wrenches = [w for w in record.wrenches if inside(record, fault, w.stamp_ns)]
-    forces = np.array([w.values[2] for w in wrenches])
-    timely = ~overdue(record, np.array([w.stamp_ns for w in wrenches]))
-    assert timely.sum() > 200
-    np.testing.assert_allclose(forces[timely], FELT, rtol=0.02)
+    """The bridge had each frame in time: the session tries it again where it had not."""
+    forces = record.forces(fault, before=f'{fault} over')
+    assert len(forces) >= HEARD / 2
+    np.testing.assert_allclose(forces, FELT, rtol=0.02)
     assert 'FAULT' not in states(record, fault)
 
 
 def test_forces_that_have_waited_in_a_queue_are_not_felt_as_if_they_were_new(record):
     forces = record.forces('waited', STALE + FADE + SCHEDULING, before='waited over')
-    assert len(forces) > 200
+    assert len(forces) > HEARD / 4
     assert not forces.any()
     assert 'FAULT' not in states(record, 'waited')
 
 
 def test_refused_messages_are_counted(record):
-    assert refused(record.statuses[-1]) > 400
+    assert refused(record.statuses[-1]) > 0.9 * record.marks['refusable']
 
 
 def test_the_age_of_the_pose_at_the_force_is_told(record):
@@ -341,7 +355,7 @@ def test_the_age_of_the_pose_at_the_force_is_told(record):
 
 def test_a_surface_that_loses_the_touched_triangle_is_not_felt_any_more(record):
     forces = record.forces('hole', 0.05 + SCHEDULING, before='hole over')
-    assert len(forces) > 200
+    assert len(forces) > HEARD / 4
     assert not forces.any()
     assert 'FAULT' not in states(record, 'hole')
     told = [c.values[1] for c in record.contacts if inside(record, 'hole', c.stamp_ns)]

@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from sensor_msgs.msg import Joy
 
-from haptic_bridge.settings import DeviceSettings
-from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec, StampedCodec
-from tissue_sim import ros
+from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec, StampedCodec
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
 DOMAIN = 85
 SCENE = """
@@ -103,7 +103,9 @@ def hostile(world: HostileWorld) -> st.SearchStrategy:
 
     def force() -> list:
         """The next frame: what is older is not looked at."""
-        return [world.revision + 1] + [0] * (ForceSampleCodec.fields['elastic_energy'].stop - 1)
+        return [world.revision + 1] + [0] * (
+            sum(count for _, _, count in ForceSampleCodec.layout) - 1
+        )
 
     words = st.sampled_from(['disable', 'pause', 'unhome', 'home']) | st.text(max_size=50)
     state = st.builds(

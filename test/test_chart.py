@@ -7,21 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.reproduction import block_100, block_258, efficiency, orders
-from session.measure import chart, stability_report
-from session.measure.chart import THESIS, cost_for, sentence, write_chart
-from session.measure.chart_front import beaten, read_points, scenes, standing
-from session.measure.chart_measure import Point, cpu_per_second, with_front
-from session.measure.chart_meshes import end_load, kuhn_block
-from session.measure.chart_problems import AfterCut, Cantilever, static_problems
-from session.measure.chart_reference import HexGrid, Solid, exact_beam, extrapolated, graded
-from session.measure.chart_region import LocalPalpation, describe
-from session.measure.chart_vibration import Vibration
-from session.measure.stability_report import highest_mode, measured_limit
-from session.scene import load_scene
-from tissue_sim.assembly import make_task
-from tissue_sim.dynamics import TimeStepping
-from tissue_sim.elasticity import ElasticModel
+from bench.accuracy import chart
+from bench.accuracy import stability as stability_report
+from bench.accuracy.chart import THESIS, cost_for, sentence, write_chart
+from bench.accuracy.front import read_points, reasons_off_front, scenes, standing
+from bench.accuracy.measure import Point, cpu_per_second, with_front
+from bench.accuracy.problems import AfterCut, Cantilever, static_problems
+from bench.accuracy.reference import HexGrid, Solid, exact_beam, extrapolated, graded
+from bench.accuracy.region import LocalPalpation, describe
+from bench.accuracy.reproduction import block_100, block_258, efficiency, orders
+from bench.accuracy.stability import highest_mode, measured_limit
+from bench.accuracy.vibration import Vibration
+from bench.common.meshes import end_load, kuhn_block
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.tissue_sim.assembly import make_task
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+
+pytestmark = pytest.mark.long
 
 BEAM = Solid((0.10, 0.02, 0.02), 5000.0, 0.3)
 
@@ -51,6 +54,7 @@ def test_the_reference_solver_stretches_a_bar_exactly() -> None:
     assert (grid.stiffness @ u)[pulled].sum() == pytest.approx(5000.0 * 1e-4 * 0.01, rel=1e-9)
 
 
+@pytest.mark.thorough
 def test_the_reference_beam_vibrates_as_euler_and_bernoulli_say_for_slender_ones() -> None:
     omega, _ = Vibration().reference
     slender = 1.875104**2 * np.sqrt(5000.0 * 0.02**2 / 12 / 1050.0) / 0.1**2
@@ -119,11 +123,13 @@ def test_the_method_of_each_shipped_scene_lies_on_the_front_of_the_chart(scene: 
 
 def test_a_method_that_another_beats_is_named_with_what_beats_it() -> None:
     points = with_front([*POINTS, point('corotational', 'symplectic_euler', 2, 0.04, 0.09)])
-    why = beaten(points, 'cantilever_0.47', ('linear_smoothed', 'symplectic_euler'))
+    why = reasons_off_front(points, 'cantilever_0.47', ('linear_smoothed', 'symplectic_euler'))
     assert why == ['corotational by symplectic_euler is faster and as near with 48 tetrahedra']
-    why = beaten(points, 'cantilever_0.47', ('linear', 'rk4'))
+    why = reasons_off_front(points, 'cantilever_0.47', ('linear', 'rk4'))
     assert 'another method on another mesh is faster and as near' in why[-1]
-    assert beaten(points, 'indentation', ('linear', 'rk4')) == ['it has not been measured there']
+    assert reasons_off_front(points, 'indentation', ('linear', 'rk4')) == [
+        'it has not been measured there'
+    ]
 
 
 def test_the_cost_of_an_error_is_read_off_the_line_of_a_method() -> None:
@@ -160,7 +166,7 @@ def test_the_chart_prints_the_points_for_machines_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(chart, 'measure', lambda progress, coarse: POINTS)
-    monkeypatch.setattr(chart, 'yardstick', lambda: 6.0)
+    monkeypatch.setattr(chart, 'reference_cost', lambda: 6.0)
     monkeypatch.setattr(chart, 'write_chart', lambda folder, points, yardsticks: None)
     chart.run_chart(tmp_path, as_json=True)
     told = json.loads(capsys.readouterr().out)

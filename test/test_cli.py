@@ -10,10 +10,22 @@ from pathlib import Path
 
 import pytest
 
-from session import cli, commands_own
-from session.checks import ALONE, NO_TESTS, TESTS, Check, all_checks, run_checks, verdict
-from session.scene import SCENES, find_scene, load_scene
-from session.status import Status
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.cli import main as cli
+from cutting_trainer.cli import own as commands_own
+from cutting_trainer.cli.bag_errors import reading
+from cutting_trainer.cli.checks import (
+    ALONE,
+    NO_TESTS,
+    TESTS,
+    Check,
+    all_checks,
+    run_checks,
+    verdict,
+)
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.scene import SCENES, find_scene, load_scene
+from cutting_trainer.session.status import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -30,15 +42,14 @@ def test_help_shows_each_command_with_one_line_and_the_exit_statuses(
     assert trainer('--help') == 0
     text = capsys.readouterr().out
     assert re.search(r'demo +Run a session', text)
-    assert re.search(r'test +Run all checks', text)
+    assert re.search(r'test +Run the checks', text)
     for status in Status:
         assert status.meaning.split()[0] in text and str(int(status)) in text
 
 
 def test_help_shows_the_units_of_what_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
-    assert trainer('soak', '--help') == 0
-    text = capsys.readouterr().out
-    assert 'Duration [min]' in text and 'session [s]' in text
+    assert trainer('demo', '--help') == 0
+    assert 'Duration [s]' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -169,7 +180,7 @@ def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch: pytest.Mo
     def stumble(options: object) -> Status:
         raise ValueError('a bug')
 
-    monkeypatch.setattr('session.demo.run_demo', stumble)
+    monkeypatch.setattr('cutting_trainer.session.demo.run_demo', stumble)
     with pytest.raises(ValueError, match='a bug'):
         cli.main(['demo'])
 
@@ -180,12 +191,12 @@ def test_interrupt_outside_a_session_has_the_status_of_an_interrupt(
     def interrupted(options: object) -> Status:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr('session.demo.run_demo', interrupted)
+    monkeypatch.setattr('cutting_trainer.session.demo.run_demo', interrupted)
     assert trainer('demo') == Status.INTERRUPTED
 
 
 def test_start_of_the_command_line_does_not_load_the_core() -> None:
-    code = 'import session.cli, sys; print(*sys.modules)'
+    code = 'import cutting_trainer.cli.main, sys; print(*sys.modules)'
     loaded = subprocess.run(
         [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.split()
@@ -227,12 +238,19 @@ def test_test_command_of_an_installation_says_that_the_tests_are_in_the_source(
 
 
 def test_extra_arguments_of_the_test_command_reach_pytest() -> None:
-    *others, beside, alone = all_checks(['-k', 'patch', '--maxfail=1'], Path('/tmp/x'))
+    *others, beside, alone = all_checks(['-k', 'patch', '--maxfail=1'], Path('/tmp/x'), 'usual')
     assert [check.name for check in others] == ['ruff check', 'ruff format', 'mypy']
     for tests, part in ((beside, 'beside'), (alone, 'alone')):
-        assert tests.argv[1:6] == ('-m', 'pytest', '-k', 'patch', '--maxfail=1')
-        assert {f'--part={part}', f'--basetemp=/tmp/x/{part}'} < set(tests.argv)
+        assert tests.argv[1:3] == ('-m', 'pytest')
+        assert tests.argv[-3:] == ('-k', 'patch', '--maxfail=1')
+        assert {'--tier=usual', f'--part={part}', f'--basetemp=/tmp/x/{part}'} < set(tests.argv)
     assert '--numprocesses=auto' in beside.argv and '--numprocesses=auto' not in alone.argv
+
+
+def test_the_quick_tier_needs_no_graph_and_no_types() -> None:
+    checks = all_checks([], Path('/tmp/x'), 'quick')
+    assert [check.name for check in checks] == ['ruff check', 'ruff format', TESTS]
+    assert verdict({'lint': 0, TESTS: NO_TESTS})[0] == NO_TESTS
 
 
 def test_arguments_may_choose_tests_of_one_part_but_not_of_none() -> None:
@@ -245,7 +263,7 @@ def test_arguments_may_choose_tests_of_one_part_but_not_of_none() -> None:
 def test_nodes_get_their_parameters_quoted_and_one_environment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from session.graph import node_environment, session_nodes
+    from cutting_trainer.session.graph import node_environment, session_nodes
 
     nodes = session_nodes(Path('/a b/c: d.yaml'), Path('/bags/x'), 3, 12)
     assert [node.name for node in nodes][-1] == 'recorder' and nodes[-1].records
@@ -258,3 +276,44 @@ def test_nodes_get_their_parameters_quoted_and_one_environment(
     assert environment['ROS_DOMAIN_ID'] == '5'
     assert environment['FASTRTPS_DEFAULT_PROFILES_FILE'].endswith('config/dds/localhost.xml')
     assert environment['PYTHONPATH'].split(os.pathsep)[0] == str(ROOT)
+
+
+def test_a_sentence_of_the_trainer_about_a_bag_stays_as_it_is() -> None:
+    with (
+        pytest.raises(SessionError, match=r'^the bag has no cut: record one$'),
+        reading(Path('bag')),
+    ):
+        raise SessionError('the bag has no cut: record one')
+    with pytest.raises(BagError, match='cannot be used'), reading(Path('bag')):
+        int('nothing')
+
+
+def test_tests_that_failed_alone_run_again_by_themselves_and_only_they(tmp_path: Path) -> None:
+    (tmp_path / 'test_two.py').write_text(
+        'from pathlib import Path\n'
+        'RUNS = Path(__file__).parent / "runs"\n'
+        'def test_passes(): RUNS.open("a").write("p")\n'
+        'def test_fails_once():\n'
+        '    RUNS.open("a").write("f")\n'
+        '    assert RUNS.read_text().count("f") > 1\n'
+    )
+    *_, alone = all_checks(['test_two.py'], tmp_path / 'made', 'usual')
+    kept = [a for a in alone.argv if not a.startswith(('--tier', '--part'))]
+    (tmp_path / 'made').mkdir()
+    results = run_checks(
+        [Check(ALONE, tuple(kept), alone.repetitions)], tmp_path, lambda name: None
+    )
+    assert results == {ALONE: 0}
+    assert (tmp_path / 'runs').read_text() == 'pff'
+
+
+def test_scene_for_a_real_arm_needs_no_script_and_the_emulated_arm_says_that_it_does(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    text = (SCENES / 'palpation.yaml').read_text()
+    mesh = f'{SCENES.parent}/meshes/'
+    scene = tmp_path / 'real_arm.yaml'
+    scene.write_text(text[: text.index('\narm:')].replace('../meshes/', mesh) + '\n')
+    assert load_scene(str(scene)).arm.script is None
+    assert trainer('demo', '--scene', str(scene), '--bag', str(tmp_path / 'bag')) == 2
+    assert 'has no arm.script' in one_error_line(capsys)

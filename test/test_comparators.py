@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from surfaces import grid, slab
 
-from haptic_bridge.comparators import CONTACTS, GodObject, Penalty
-from haptic_bridge.proxy import Proxy
-from haptic_bridge.surface import Surface
+from bench.haptics.comparators import CONTACTS, GodObject, Penalty
+from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
+
+pytestmark = pytest.mark.long
 
 RADIUS = 1e-3
 

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from meshes import box
 
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.compliance import solve_static
-from tissue_sim.contact import State, ToolContact
-from tissue_sim.contact_stiffness import ContactStiffness, spring_of
-from tissue_sim.coupling import HOLD, PUSH, Coupling
-from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact
+from cutting_trainer.tissue_sim.contact.tool_spring import ContactName, ToolSprings
+from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.simulation.local_stiffness import ContactStiffness
 
 SIZE, TOP, RADIUS, SPRING = 0.008, 0.024, 0.004, 200.0
 UP, REST = np.array([0.0, 0.0, 1.0]), np.zeros(3)
@@ -27,6 +28,15 @@ def tissue() -> Dynamics:
     nodes, tets = box((6, 6, 3), SIZE)
     mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
     return Dynamics(mesh, MATERIAL, 'linear_smoothed', None, None)
+
+
+def springs(dynamics: Dynamics, name: ContactName = 'triangle') -> ToolSprings:
+    return ToolSprings(dynamics.mesh, MATERIAL.plane_modulus, name)
+
+
+def spring_of(dynamics: Dynamics, pressing: ToolContact) -> Coupling:
+    """The spring of a contact with a triangle."""
+    return springs(dynamics).spring(pressing, 0.0, 0.0)
 
 
 def touched(mesh: TetMesh, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +54,7 @@ def contact(mesh: TetMesh, gap: float) -> ToolContact:
     nodes, weights = touched(mesh, AT)
     height = gap + RADIUS
     return ToolContact(
-        state=State.TOUCHING if gap < 0 else State.NONE,
+        state=ContactState.TOUCHING if gap < 0 else ContactState.NONE,
         topology=mesh.topology,
         nodes=nodes,
         weights=weights,
@@ -71,8 +81,8 @@ def stiffness_at(dynamics: Dynamics, place: np.ndarray) -> float:
 def test_a_sliding_tool_is_told_the_stiffness_of_where_it_will_be(direction) -> None:
     dynamics = tissue()
     pressing = contact(dynamics.mesh, -0.004)
-    spring, force, way = spring_of(pressing), 0.1 * UP, 2e-3 * np.array([*direction, 0.0])
-    told = ContactStiffness(dynamics)
+    spring, force, way = spring_of(dynamics, pressing), 0.1 * UP, 2e-3 * np.array([*direction, 0.0])
+    told = ContactStiffness(dynamics, springs(dynamics))
     for _ in range(40):
         matrix = told.matrix(spring, pressing, way, force)
     here, ahead = stiffness_at(dynamics, AT), stiffness_at(dynamics, AT + 1.2 * way[:2])
@@ -92,9 +102,9 @@ def test_the_stiffness_told_is_that_of_the_nodes_that_a_budget_lets_move(moving:
     mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
     stepping, few = TimeStepping('symplectic_euler'), ActiveSettings('budget', moving)
     dynamics = Dynamics(mesh, MATERIAL, 'linear', stepping, few)
-    told, pushes = ContactStiffness(dynamics), []
+    told, pushes = ContactStiffness(dynamics, springs(dynamics)), []
     for depth in (1e-3, 2e-3):
-        spring = spring_of(contact(mesh, -depth))
+        spring = spring_of(dynamics, contact(mesh, -depth))
         for _ in range(120):
             point = spring.point(dynamics.positions)  # along the surface it slips between frames
             spring.start = spring.end = point + ((spring.end - point) @ UP) * UP
@@ -111,7 +121,9 @@ def test_the_stiffness_told_is_that_of_the_nodes_that_a_budget_lets_move(moving:
 def test_a_tool_that_does_not_go_along_the_surface_is_told_of_no_change_along_it(way) -> None:
     dynamics = tissue()
     pressing = contact(dynamics.mesh, -0.004)
-    matrix = ContactStiffness(dynamics).matrix(spring_of(pressing), pressing, way, 0.1 * UP)
+    matrix = ContactStiffness(dynamics, springs(dynamics)).matrix(
+        spring_of(dynamics, pressing), pressing, way, 0.1 * UP
+    )
     np.testing.assert_array_equal(matrix, matrix[2, 2] * np.outer(UP, UP))
 
 
@@ -121,7 +133,9 @@ def test_no_contact_however_forged_makes_it_much_stiffer_than_the_coupling(stiff
     pressing = replace(contact(dynamics.mesh, -0.004), stiffness=stiffness)
     way = np.array([0.002, 0.0, 0.0])
     for force in (1e3, 1e6):  # a depth of metres, as no proxy has it
-        matrix = ContactStiffness(dynamics).matrix(spring_of(pressing), pressing, way, force * UP)
+        matrix = ContactStiffness(dynamics, springs(dynamics)).matrix(
+            spring_of(dynamics, pressing), pressing, way, force * UP
+        )
         assert np.trace(matrix) <= stiffness
         assert matrix[2, 0] != 0
         assert np.abs(matrix).max() <= 4.001 * stiffness
@@ -134,7 +148,7 @@ def test_a_splinter_that_nothing_holds_has_a_stiffness_between_none_and_the_spri
     random = np.random.default_rng(0)
     for _ in range(20):
         dynamics = Dynamics(mesh, MATERIAL, model, None, None)
-        told = ContactStiffness(dynamics)
+        told = ContactStiffness(dynamics, springs(dynamics))
         for _ in range(600):
             touched = random.choice(4, random.integers(1, 4), replace=False)
             normal = random.normal(size=3)
@@ -152,7 +166,7 @@ def test_a_splinter_that_nothing_holds_has_a_stiffness_between_none_and_the_spri
 def told_after(seconds: float, gap: float, speed: float) -> float:
     """Stiffness [N/m] that a free tool at a gap [m] is told after a while; 0: nothing."""
     dynamics = tissue()
-    told, free = ContactStiffness(dynamics), contact(dynamics.mesh, gap)
+    told, free = ContactStiffness(dynamics, springs(dynamics)), contact(dynamics.mesh, gap)
     for _ in range(round(seconds / FRAME)):
         matrix = told.matrix(Coupling(), free, speed * FRAME * UP, REST)
     return float(np.trace(matrix))
@@ -169,7 +183,44 @@ def test_a_free_tool_is_told_what_it_would_meet_if_it_can_be_there_before_it_is_
 
 def test_nothing_is_foretold_of_another_connectivity_or_where_no_place_is_named() -> None:
     dynamics = tissue()
-    told, free = ContactStiffness(dynamics), contact(dynamics.mesh, 0.005)
+    told, free = ContactStiffness(dynamics, springs(dynamics)), contact(dynamics.mesh, 0.005)
     nowhere = replace(free, nodes=free.nodes[:0], weights=free.weights[:0])
     for other in (replace(free, topology=free.topology + 1), nowhere, None):
         assert not told.matrix(Coupling(), other, REST, REST).any()
+
+
+def pressed_by(dynamics: Dynamics, depth: float) -> float:
+    """Force [N] on a footprint at rest at a depth [m]."""
+    spring = springs(dynamics, 'footprint').spring(contact(dynamics.mesh, -depth), 0.0, depth)
+    load = np.zeros_like(dynamics.mesh.rest)
+    load[spring.nodes, 2] = spring.weights
+    moved = solve_static(dynamics.model, dynamics.inverse_mass > 0, load)
+    soft = spring.weights @ moved[spring.nodes, 2]
+    return replace(spring, stiffness=1 / (1 / SPRING + soft)).pushed(depth)
+
+
+@pytest.mark.parametrize('depth', [5e-4, 2e-3, 4e-3])
+@pytest.mark.parametrize('change', [1e-3, -4e-4])
+def test_the_stiffness_told_leads_to_the_force_at_the_next_depth(depth, change) -> None:
+    """Under a sphere it grows with depth: the tangent would be late by a frame."""
+    dynamics = tissue()
+    force = pressed_by(dynamics, depth)
+    makes = springs(dynamics, 'footprint')
+    spring = makes.spring(contact(dynamics.mesh, -depth), force, 0.0)
+    told = ContactStiffness(dynamics, makes)
+    for _ in range(40):
+        matrix = told.matrix(spring, None, -change * UP, force * UP)
+    after = force + np.trace(matrix) * change
+    assert after == pytest.approx(pressed_by(dynamics, depth + change), rel=0.03)
+
+
+def test_a_tool_that_slides_on_its_footprint_is_told_of_next_to_no_change() -> None:
+    """By triangle the same slide changes the stiffness by several per cent."""
+    dynamics = tissue()
+    makes = springs(dynamics, 'footprint')
+    pressing, way = contact(dynamics.mesh, -0.004), 2e-3 * np.array([1.0, 0.0, 0.0])
+    force = pressed_by(dynamics, 0.004)
+    told = ContactStiffness(dynamics, makes)
+    for _ in range(40):
+        matrix = told.matrix(makes.spring(pressing, force, 0.0), pressing, way, force * UP)
+    assert abs(UP @ matrix @ (1.2 * way)) < 0.01 * force

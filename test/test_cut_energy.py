@@ -5,15 +5,17 @@ import pytest
 from meshes import irregular_box
 from test_blade import contact_at, path
 
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from tissue_sim.blade import Resistance
-from tissue_sim.contact import Command, Frame
-from tissue_sim.dynamics import TimeStepping
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
-from tissue_sim.simulation import TissueSimulation
-from tissue_sim.topology import CUT
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.contact.tool import CutCommand, Frame
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.topology import CUT
+from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+
+pytestmark = pytest.mark.long
 
 TOUGHNESS, RATE = 40.0, 500.0
 MATERIAL = Material(30000.0, 0.4, 1000.0, 5.0, 2e-4)
@@ -40,7 +42,7 @@ class Stroke:
         simulation = self.simulation
         if self._asked is not None:
             frame, positions = self._asked
-            if frame.command == Command.ADVANCE:
+            if frame.command == CutCommand.ADVANCE:
                 self._apply(self.method.advance(simulation.mesh, positions, frame.sweep))
             else:
                 self._apply(self.method.finish(simulation.mesh, positions))
@@ -71,7 +73,13 @@ REVERSED = (*ENTRY, (0.030, 0.0138, 0.0112), (0.0235, 0.0138, 0.0112), (0.037, 0
 """The device comes back by 6.5 mm: the edge, which lags behind it, by more than one element."""
 
 
-@pytest.mark.parametrize('stops', [STRAIGHT, REVERSED], ids=['straight', 'reversed'])
+@pytest.mark.parametrize(
+    'stops',
+    [
+        pytest.param(STRAIGHT, id='straight'),
+        pytest.param(REVERSED, id='reversed', marks=pytest.mark.thorough),
+    ],
+)
 def test_the_work_of_the_blade_is_accounted_for_within_five_per_cent(stops) -> None:
     nodes, tets = irregular_box((24, 10, 8), 0.0025, 3, jitter=0.1)
     stroke = Stroke(

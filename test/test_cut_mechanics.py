@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 from meshes import box, irregular_box
 
-from cutting.fuzz import random_stroke, shuffled_box
-from cutting.method import CASES
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from tissue_sim.blade import Sweep
-from tissue_sim.compliance import solve_static
-from tissue_sim.elasticity import ElasticModel
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
-from tissue_sim.topology import CUT
+from bench.cuts.random_strokes import random_stroke, shuffled_box
+from cutting_trainer.cutting.method import CASES
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.topology import CUT
+
+pytestmark = pytest.mark.long
 
 MATERIAL = Material(10000.0, 0.3, 1000.0)
 CELLS, SIZE = (24, 8, 16), 0.0025

@@ -5,12 +5,12 @@ import pytest
 from meshes import box, irregular_box
 from strokes import draw, mesh_of, method_named, straight, total_area
 
-from cutting.checks import pieces
-from cutting.geometry import smallest_altitudes
-from cutting.settings import CuttingSettings
-from tissue_sim.elasticity import ElasticModel
-from tissue_sim.material import Material
-from tissue_sim.mesh import interpolated
+from cutting_trainer.cutting.checks import pieces
+from cutting_trainer.cutting.geometry import smallest_altitudes
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import interpolated
 
 H = 0.005
 TISSUE = Material(5000.0, 0.45, 1050.0)

@@ -20,11 +20,11 @@ from live import free_domain, wait_for
 from meshes import box
 from rclpy.executors import SingleThreadedExecutor
 
-from cutting.checks import check_mesh, pieces
-from session.graph import node_environment
-from tissue_sim import ros
-from tissue_sim.mesh import TetMesh
-from tissue_sim.messages import DeltaEncoder, delta_from, mesh_message
+from cutting_trainer.cutting.checks import check_mesh, pieces
+from cutting_trainer.node_common import ros
+from cutting_trainer.session.graph import node_environment
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, delta_from, mesh_message
 
 pytestmark = pytest.mark.real_time
 
@@ -137,7 +137,7 @@ class Cutting:
     def start(self) -> None:
         arguments = ['--ros-args', '-p', f'scene:={self._scene}']
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'cutting.node', *arguments],
+            [sys.executable, '-m', 'cutting_trainer.cutting.node', *arguments],
             cwd=ROOT,
             env=self._environment,
             stdout=subprocess.PIPE,
@@ -203,7 +203,7 @@ def test_killed_in_the_middle_of_a_cut_and_started_again_it_goes_on_and_parts_th
     assert pieces(tissue.mesh).max() == 0
     cutting.kill()
     cutting.start()
-    back = 0.005  # an element: see `Blade.unswept`
+    back = 0.005  # an element: see `Blade.retry_sweep`
     for begin, end in pairwise(ways[8:]):
         tissue.cut(begin - back, end)
         back = 0.0

@@ -8,10 +8,20 @@ import pytest
 from hypothesis import given, note, settings
 from hypothesis import strategies as st
 
-from cutting.fuzz import KINDS, Scene, play, random_scene, random_stroke, run, shuffled_box
+from bench.cuts.random_strokes import (
+    KINDS,
+    Scene,
+    play,
+    random_scene,
+    random_stroke,
+    run,
+    shuffled_box,
+)
+
+pytestmark = pytest.mark.long
 
 
-@settings(max_examples=120, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3),
     cells=st.tuples(*[st.integers(1, 4)] * 3),
@@ -29,13 +39,13 @@ def test_a_cut_keeps_the_mesh_sound_after_every_batch(kinds, cells, jitter, moti
     except Exception:
         path = Path(tempfile.gettempdir()) / 'cut-scene.npz'
         scene.save(path)
-        note(f'replay with cutting.fuzz.play(Scene.load({str(path)!r}))')
+        note(f'replay with bench.cuts.random_strokes.play(Scene.load({str(path)!r}))')
         raise
 
 
 @pytest.mark.parametrize('method', ['combined_midpoint', 'subdivide', 'separate'])
 def test_the_other_methods_keep_the_mesh_sound_too(method, tmp_path):
-    assert run(40, 1, method=method, folder=tmp_path).violations == ()
+    assert run(12, 1, method=method, folder=tmp_path).violations == ()
 
 
 def test_random_strokes_meet_every_case(tmp_path):
@@ -56,7 +66,7 @@ def test_a_scene_that_breaks_an_invariant_is_saved(tmp_path, monkeypatch):
     def broken(scene, method):
         raise AssertionError('broken')
 
-    monkeypatch.setattr('cutting.fuzz.play', broken)
+    monkeypatch.setattr('bench.cuts.random_strokes.play', broken)
     report = run(1, 3, folder=tmp_path)
     assert report.violations == ('AssertionError: broken',)
     assert Scene.load(report.saved[0]).strokes

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from haptic_bridge.convention import DeviceConvention
-from haptic_bridge.force_path import ForcePath
-from haptic_bridge.operating_state import OperatingStateMachine, State
-from haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.settings import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
@@ -22,10 +21,11 @@ from haptic_bridge.settings import (
     Transform,
     check_together,
 )
-from haptic_bridge.stream_watch import QUEUED, StreamWatch
-from haptic_bridge.wire import Sample
-from tissue_sim.refusals import Refusals
-from tissue_sim.share import share_folder
+from cutting_trainer.node_common.cdr_codec import StampedMessage
+from cutting_trainer.node_common.operating_state import CrtkState, OperatingStateMachine
+from cutting_trainer.node_common.rejections import RejectionStatistics
+from cutting_trainer.node_common.share import share_folder
+from cutting_trainer.node_common.stream_monitor import MAX_QUEUE_DELAY_S, StreamMonitor
 
 PROFILES = sorted((share_folder() / 'config' / 'devices').glob('*.yaml'))
 LIMITS = ('max_force', 'max_slew', 'max_stiffness', 'workspace')
@@ -86,7 +86,7 @@ def test_a_convention_maps_motion_force_and_power_alike(device, position, turn, 
     convention = DeviceConvention(device)
     pose = (*position, *turn.as_quat())
     spoken = convention.spoken_pose(pose)
-    assert_allclose(convention.pose(Sample(1, '', spoken)).values, pose, atol=1e-12)
+    assert_allclose(convention.pose(StampedMessage(1, '', spoken)).values, pose, atol=1e-12)
     mirror = np.array([-1.0 if axis == device.mirrored_axis else 1.0 for axis in 'xyz'])
     unit = UNITS[device.length_unit]
     assert_allclose(np.multiply(unit, spoken[:3]), mirror * position, atol=1e-12)
@@ -129,12 +129,12 @@ def test_what_a_device_speaks_changes_nothing_in_what_the_hand_feels(frame, axis
         for tick in range(1, 60):
             depth = transform.to_device(np.array([0.0, 0.0, 0.006 - 1e-4 * tick]))
             spoken = convention.spoken_pose((*depth.tolist(), *turn.as_quat().tolist()))
-            sample = (tick, tick, 1, tick, 0, tick, 0, *(0.0,) * 18)
+            sample = (tick, tick, 1, tick, 0, tick, 0, *(0.0,) * 18, 0)
             wrench = path.tick(
                 tick * 1_000_000,
-                state=State.ENABLED,
-                pose=convention.pose(Sample(tick * 1_000_000, '', spoken)),
-                sample=Sample(tick, '', sample),
+                state=CrtkState.ENABLED,
+                pose=convention.pose(StampedMessage(tick * 1_000_000, '', spoken)),
+                sample=StampedMessage(tick, '', sample),
                 surface=flat_surface(revision=tick),
             ).wrench
         force = np.array(convention.force(convention.force(wrench))[:3])
@@ -149,7 +149,7 @@ def test_what_a_device_speaks_changes_nothing_in_what_the_hand_feels(frame, axis
 
 
 def test_a_restarted_publisher_is_one_and_two_publishers_are_two():
-    watch = StreamWatch('cp')
+    watch = StreamMonitor('cp')
     for number in (*range(1, 100), *range(1, 50)):
         assert watch.see(number, 0, number * 1_000_000) == ''
     said = [
@@ -163,13 +163,13 @@ def test_a_restarted_publisher_is_one_and_two_publishers_are_two():
 
 
 def test_numbers_that_are_not_given_are_not_looked_at():
-    watch = StreamWatch('cp')
+    watch = StreamMonitor('cp')
     assert not any(watch.see(0, 0, tick) for tick in range(100))
 
 
 @pytest.mark.parametrize('jump', [3600.0, -3600.0, 0.6, -0.6])
 def test_a_clock_that_jumps_is_told_once_and_its_new_time_is_taken(jump):
-    watch = StreamWatch('cp')
+    watch = StreamMonitor('cp')
     stamps = [100 * SECOND + k * 1_000_000 for k in range(10)]
     stamps += [round(stamp + jump * SECOND) for stamp in stamps]
     said = [watch.see(k + 1, stamp, k % 10 * 1_000_000) for k, stamp in enumerate(stamps)]
@@ -178,7 +178,7 @@ def test_a_clock_that_jumps_is_told_once_and_its_new_time_is_taken(jump):
 
 
 def test_a_message_that_is_late_or_invalid_is_no_jump_of_the_clock():
-    watch = StreamWatch('cp')
+    watch = StreamMonitor('cp')
     assert not watch.see(1, SECOND, SECOND)
     assert not watch.see(2, SECOND + 1, round(1.4 * SECOND))
     assert not watch.see(3, 0, 2 * SECOND)
@@ -186,7 +186,7 @@ def test_a_message_that_is_late_or_invalid_is_no_jump_of_the_clock():
 
 
 def test_messages_that_wait_in_a_network_are_late_and_its_clock_is_believed():
-    watch = StreamWatch('force', queues=True)
+    watch = StreamMonitor('force', queues=True)
     delays = [0.02] * 30 + [0.8 - 0.03 * k for k in range(20)] + [0.02] * 30
     late = []
     for number, delay in enumerate(delays, 1):
@@ -197,7 +197,7 @@ def test_messages_that_wait_in_a_network_are_late_and_its_clock_is_believed():
 
 
 def test_messages_are_older_by_what_they_waited_more_than_is_usual():
-    watch = StreamWatch('force', queues=True)
+    watch = StreamMonitor('force', queues=True)
     frame = SECOND // 30
     delays = [0.02] * 30 + [0.4 - 0.03 * k for k in range(12)] + [0.02] * 30
     waited = []
@@ -212,18 +212,18 @@ def test_messages_are_older_by_what_they_waited_more_than_is_usual():
 
 
 def test_a_clock_that_was_set_back_behind_a_network_is_told_in_the_end():
-    watch = StreamWatch('force', queues=True)
+    watch = StreamMonitor('force', queues=True)
     said = []
     for number in range(1, 200):
         now = number * SECOND // 30
         said.append(watch.see(number, now + 100 * SECOND - (number > 30) * 3600 * SECOND, now))
     (told,) = (k for k, sentence in enumerate(said) if sentence)
-    assert (told - 30) / 30 == pytest.approx(QUEUED, abs=0.1)
+    assert (told - 30) / 30 == pytest.approx(MAX_QUEUE_DELAY_S, abs=0.1)
     assert not watch.late
 
 
 def test_a_frame_that_changes_is_told_and_its_new_name_is_taken():
-    watch = StreamWatch('cp')
+    watch = StreamMonitor('cp')
     frames = ['base', 'base', 'camera', 'camera']
     said = [watch.see(n, 0, n, frame) for n, frame in enumerate(frames, 1)]
     assert [n for n, sentence in enumerate(said) if sentence] == [2]
@@ -234,7 +234,7 @@ class FakeNode:
     max_message = 1000
 
     def __init__(self):
-        self.refusals = Refusals()
+        self.rejections = RejectionStatistics()
 
     def create_subscription(self, _kind, topic, callback, _qos, *, raw):
         self.topic, self.press = topic, callback
@@ -243,7 +243,7 @@ class FakeNode:
 
 @pytest.fixture
 def held():
-    crtk = pytest.importorskip('haptic_bridge.crtk')
+    crtk = pytest.importorskip('cutting_trainer.node_common.crtk')
     joy = pytest.importorskip('sensor_msgs.msg').Joy
     node, machine = FakeNode(), OperatingStateMachine()
     button = crtk.HoldButton(node, 'arm', machine)
@@ -255,11 +255,11 @@ def test_there_is_force_only_while_the_button_is_held(held):
     button, machine, press = held
     machine.command('enable')
     button.enforce()
-    assert machine.state is State.PAUSED
+    assert machine.state is CrtkState.PAUSED
     press(True)
-    assert machine.state is State.ENABLED
+    assert machine.state is CrtkState.ENABLED
     press(False)
-    assert machine.state is State.PAUSED
+    assert machine.state is CrtkState.PAUSED
 
 
 def test_the_button_resumes_neither_a_pause_by_command_nor_a_fault(held):
@@ -269,10 +269,10 @@ def test_the_button_resumes_neither_a_pause_by_command_nor_a_fault(held):
     machine.command('pause')
     press(False)
     press(True)
-    assert machine.state is State.PAUSED
+    assert machine.state is CrtkState.PAUSED
     machine.command('disable')
     machine.fault('broken')
     press(False)
     press(True)
     button.enforce()
-    assert machine.state is State.FAULT
+    assert machine.state is CrtkState.FAULT

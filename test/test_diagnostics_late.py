@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-ros = pytest.importorskip('tissue_sim.ros')
+ros = pytest.importorskip('cutting_trainer.node_common.ros')
 
 
 class Clock:

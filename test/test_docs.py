@@ -1,21 +1,31 @@
 """The documents name what is there: commands, files, topics, keys."""
 
 import ast
-import importlib
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.main import get_command
 
-from haptic_bridge.operating_state import crtk_types
-from session import scene_reference
-from session.status import Status
-from tissue_sim import ros
+from bench.commands import app as bench
+from bench.reference import scenes as scene_reference
+from cutting_trainer.cli.completion import LAUNCHERS_OWN
+from cutting_trainer.cli.main import app
+from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.operating_state import crtk_types
+from cutting_trainer.session.status import Status
+
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md')))
+PAGES = (
+    *(ROOT / f'{name}.md' for name in ('README', 'CONTRIBUTING', 'SECURITY')),
+    *sorted((ROOT / 'docs').glob('*.md')),
+)
 TEXTS = {page: page.read_text(encoding='utf-8') for page in PAGES}
 CRTK = {'OperatingState': 'operating_state', 'StringStamped': 'command'}
 
@@ -25,29 +35,36 @@ def launched(*arguments: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def help_of(command: str) -> str:
-    module = [sys.executable, '-m', 'session.cli', command, '--help']
-    done = subprocess.run(module, cwd=ROOT, capture_output=True, text=True, check=False)
-    return done.stdout if done.returncode == 0 else ''
+def options_of(command: Any) -> list[str]:
+    return [option for p in command.params for option in (*p.opts, *p.secondary_opts)]
+
+
+def measuring() -> set[str]:
+    """Names of the commands of `./trainer bench`."""
+    return set(get_command(bench).commands)
 
 
 def test_every_command_and_option_in_the_documents_exists() -> None:
-    known = set(re.findall(r'^  ([\w-]+) ', launched('--help'), re.MULTILINE))
+    commands = dict(get_command(app).commands)
+    benches = get_command(bench).commands
+    commands |= {f'bench {name}': command for name, command in benches.items()}
+    commands['chart'] = benches['chart']
+    commands['validate'] = benches['validate']
+    known = {*commands, *LAUNCHERS_OWN}
     used: dict[str, set[str]] = {}
     for text in TEXTS.values():
-        for command, rest in re.findall(r'\./trainer ([a-z][\w-]*)([^`\n]*)', text):
+        for command, rest in re.findall(r'\./trainer ((?:bench )?[a-z][\w-]*)([^`\n]*)', text):
             used.setdefault(command, set()).update(re.findall(r'(?<![\w-])--?\w[\w-]*', rest))
-    assert {'demo', 'test', 'picture'} <= used.keys() <= known
+    assert {'demo', 'test', 'picture'} <= used.keys() <= known | {'bench'}
     for command, options in used.items():
-        if options and command not in ('test', 'run'):  # whose options are another's
-            shown = set(re.findall(r'--?\w[\w-]*', help_of(command)))
-            assert options <= shown, command
+        if command in commands and command not in ('test', 'run'):  # whose options are another's
+            assert options <= {'--help', *options_of(commands[command])}, command
 
 
 def test_options_that_the_readme_tells_of_exist() -> None:
     paragraph = next(p for p in TEXTS[ROOT / 'README.md'].split('\n\n') if p.startswith('`demo`'))
     options = set(re.findall(r'`(--\w+)`', paragraph))
-    assert options and options <= set(re.findall(r'--\w+', help_of('demo')))
+    assert options and options <= {*options_of(get_command(app).commands['demo'])}
 
 
 def anchors(page: Path) -> set[str]:
@@ -69,7 +86,8 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 def test_every_file_that_a_document_names_is_there(page: Path) -> None:
     folders = (
-        r'(?:tissue_sim|haptic_bridge|cutting|bags|viewer|session|config|launch|msg_defs|docs|test)'
+        r'(?:node_common|tissue_sim|haptic_bridge|cutting|bags|viewer|session|recordings|mesh_import|'
+        r'cli|bench|config|launch|msg_defs|docs|test)'
     )
     for name in re.findall(rf'`({folders}/[\w./-]*\w\.(?:py|md|yaml|xml|msg|srv))`', TEXTS[page]):
         if name != 'config/devices/my_arm.yaml':
@@ -77,15 +95,6 @@ def test_every_file_that_a_document_names_is_there(page: Path) -> None:
 
 
 # Topics and services: what the tables say, and what the nodes make.
-
-
-def rows(page: Path, pattern: str) -> set[tuple[str, str]]:
-    """Names and short types of a table: one row may name more than one topic."""
-    found = set()
-    for names, kind in re.findall(pattern, TEXTS[page], re.MULTILINE):
-        for name in re.findall(r'`([^`]+)`', names):
-            found.add((name.lstrip('/'), kind.rpartition('/')[2]))
-    return found
 
 
 BESIDE = (
@@ -104,36 +113,29 @@ BESIDE = (
 def made() -> set[tuple[str, str]]:
     """Names and short types of what the sources publish or serve."""
     found = set()
-    for folder in ('tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session'):
+    for folder in ('node_common', 'tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session'):
         for path in (ROOT / folder).rglob('*.py'):
             for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
                 maker = isinstance(call, ast.Call) and getattr(call.func, 'attr', '')
                 if maker in ('create_publisher', 'create_service') and path.name not in BESIDE:
                     kind, name = (ast.unparse(argument) for argument in call.args[:2])
-                    topic = eval(name, {'ros': ros, **vars(ros)})
+                    topic = eval(name, {'ros': ros, 'device': DeviceSettings(), **vars(ros)})
                     found.add((topic.lstrip('/'), kind))
     found |= {(ros.MARKERS, 'MarkerArray'), (ros.HAND, 'PoseStamped')}  # of the viewer
-    found |= {(service, 'GetMesh') for service in ros.MESH_KEEPERS}
+    found |= {(ros.E_STOP, 'Empty'), (ros.DIAGNOSTICS.lstrip('/'), 'DiagnosticArray')}
+    found |= {(service, 'GetMesh') for service in ros.MESH_RECOVERY_SERVICES}
     for owner in (ros.ARM, 'haptic_bridge'):
         found.add((f'{owner}/operating_state', 'OperatingState'))
         found.add((f'{owner}/state_command', 'StringStamped'))
     return found
 
 
-def test_table_of_topics_in_the_readme_is_what_the_nodes_make() -> None:
-    table = rows(ROOT / 'README.md', r'^\| (`[a-z/][^|]*`) \| (?:CRTK )?`([\w/]+)`')
-    assert table == made()
-
-
-def test_types_in_the_readme_exist() -> None:
-    for full in re.findall(r'`(\w+/(?:msg|srv)/\w+)`', TEXTS[ROOT / 'README.md']):
-        package, kind, name = full.split('/')
-        assert hasattr(importlib.import_module(f'{package}.{kind}'), name), full
+def test_types_of_crtk_exist() -> None:
     for name, field in CRTK.items():
         assert getattr(crtk_types(), field).__name__ == name
 
 
-def test_table_of_messages_in_the_architecture_names_no_other_topics() -> None:
+def test_architecture_names_no_other_topics() -> None:
     text = TEXTS[ROOT / 'docs' / 'architecture.md']
     named = set(re.findall(r'`((?:arm|haptic_bridge|tissue|tool|cutting)/\w+)`', text))
     assert named <= {name for name, _ in made()}
@@ -146,12 +148,12 @@ def test_scene_reference_is_that_of_the_models() -> None:
     text = TEXTS[scene_reference.FILE]
     assert scene_reference.MARK in text
     tables = text.partition(scene_reference.MARK)[2].strip()
-    renew = 'run `python -m session.scene_reference`'
+    renew = 'run `python -m bench.reference.scenes`'
     assert tables == scene_reference.reference().strip(), renew
 
 
 def test_every_section_of_a_scene_has_its_model() -> None:
-    from tissue_sim.scene_file import SECTIONS
+    from cutting_trainer.node_common.scene_file import SECTIONS
 
     assert tuple(scene_reference.MODELS) == SECTIONS
 
@@ -168,3 +170,16 @@ def test_exit_statuses_are_those_of_the_commands_and_of_the_launcher() -> None:
     own = {n for line in numbers for n in line.split(', ')}
     assert len(own) == 10 and own <= rows.keys()
     assert rows.keys() == own | {str(int(s)) for s in Status}
+
+
+def test_every_test_that_the_table_of_hazards_names_exists() -> None:
+    rows = [r for r in TEXTS[ROOT / 'docs' / 'hazards.md'].splitlines() if r.startswith('| ')]
+    named = 0
+    for row in rows:
+        source = ''
+        for file, name in re.findall(r'(test_\w+\.py)?(?:(?:::|, )(test_\w+)\b(?!\.py))?', row):
+            if file:
+                source = (ROOT / 'test' / file).read_text(encoding='utf-8')
+            assert not name or f'def {name}(' in source, name
+            named += bool(name)
+    assert named > 50

@@ -7,13 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import live
 import pytest
 
-from haptic_bridge import realtime
-from session import doctor
-from session.doctor import Finding
-from session.status import Status
-from tissue_sim.share import PACKAGES
+from cutting_trainer.cli import doctor
+from cutting_trainer.cli.doctor import Finding
+from cutting_trainer.node_common import realtime
+from cutting_trainer.node_common.share import PACKAGES
+from cutting_trainer.session.status import Status
+
+pytestmark = pytest.mark.long
 
 NOWHERE = '/no/such/profile.xml'
 
@@ -54,11 +57,12 @@ def test_priority_that_is_tried_is_that_of_the_fast_loops() -> None:
 
 
 def test_ports_in_use_are_counted_in_their_domain() -> None:
-    free = doctor.ports('97')
-    first = 7400 + 250 * 97 + 10
+    domain = live.free_domain()
+    free = doctor.ports(str(domain))
+    first = 7400 + 250 * domain + 10
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as used:
         used.bind(('127.0.0.1', first))
-        taken = doctor.ports('97')
+        taken = doctor.ports(str(domain))
     assert free.level == 'ok' and str(first) in free.found
     assert taken.level == 'warning' and taken.found.startswith('1 in use')
 
@@ -123,7 +127,7 @@ def test_what_is_not_set_up_is_a_warning_and_no_room_for_it_an_error(tmp_path: P
     assert doctor.set_up(folder, None, ready=False, needed=10**18).level == 'error'
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_messages_really_pass_and_without_a_transport_it_is_said_what_to_look_at(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -14,14 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import typer
 from test_docs import PAGES, TEXTS
 from test_integrate import LARGEST
+from typer.main import get_command
 
-from session import cli
-from session.domain import reserved_domain
-from session.graph import node_environment
+from bench.commands import app as bench
+from cutting_trainer.cli import main as cli
+from cutting_trainer.session.domain import reserved_domain
+from cutting_trainer.session.graph import node_environment
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[1]
 SESSION = ROOT / 'bags' / 'samples' / 'format_2' / 'straight_cut'
@@ -35,6 +38,7 @@ PLACES = {
     r'(export BAG) liver.vtu': r'\1 mesh.vtu',
     r'\b(SCENE|NAME)\b': 'block',
     r'-side --scene liver --peer [\d.]+': '-side --scene --peer',
+    r'\bFOLDER_OF_ITS_SOURCES\b': 'crtk_msgs',
     r'\bKEY=VALUE\b': 'tissue.material.toughness=40',
     r'/path/of/scene.yaml': 'config/scenes/block.yaml',
 }
@@ -116,6 +120,20 @@ CUTS_AGAIN = Elsewhere('test_replay.py::test_the_recorded_hand_cuts_the_tissue_a
 ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer test': Script('.ci/run'),
     './trainer test -k proxy -x': Nowhere('the arguments are those of pytest'),
+    **{
+        f'./trainer test --{which}': Nowhere('the tests do not run themselves')
+        for which in ('quick', 'all', 'last-failed')
+    },
+    **{
+        f'./trainer overlay{folder}': Elsewhere(
+            'test_overlay.py::test_the_launcher_builds_an_overlay_that_the_nodes_then_use',
+        )
+        for folder in ('', ' crtk_msgs')
+    },
+    'git clone https://github.com/collaborative-robotics/crtk_msgs': Nowhere('needs the network'),
+    './trainer run python -m bench.files.damaged_bags BAG 300': Nowhere(
+        'takes minutes: test_damaged_bags.py does it to fewer copies'
+    ),
     './trainer clean': Elsewhere('test_launcher.py::test_clean_leaves_nothing_but_the_lock'),
     './trainer record -o BAG': Elsewhere(
         'test_bags_live.py::'
@@ -128,12 +146,13 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     ),
     './trainer run python press.py': DRIVES,
     **{
-        f'./trainer run python -m {node}.node --ros-args -p {SMALL}{more}': DRIVES
+        f'./trainer run python -m cutting_trainer.{node}.node --ros-args -p {SMALL}{more}': DRIVES
         for node, more in NODES
     },
     **{
         f'./trainer {side} --scene --peer': Elsewhere(
-            'test_two_hosts.py::test_the_session_completes_and_cuts', ('../bench/two_hosts.py',)
+            'test_two_hosts.py::test_the_session_completes_and_cuts',
+            ('../bench/graph/two_hosts.py',),
         )
         for side in ('bridge-side', 'sim-side')
     },
@@ -149,13 +168,19 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     'source .trainer/sourced/env/bin/activate': PACKAGED,
     'colcon build': Script('.github/workflows/ci.yml'),
     'cd ../.. && colcon build': Script('.github/workflows/ci.yml', 'colcon build'),
+    'pip install -r docs/requirements.txt': Script('.github/workflows/docs.yml'),
+    'mkdocs build --strict': Script('.github/workflows/docs.yml'),
     'pre-commit install': Nowhere('changes the hooks of a clone'),
-    'pip install --dry-run --report - -r requirements.txt -r requirements-ros.txt '
-    '-r requirements-mesh.txt -r requirements-test.txt': Nowhere('renews the lock, by hand'),
+    'uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate '
+    '--no-emit-index-url -o requirements-lock.txt requirements.txt requirements-ros.txt '
+    'requirements-mesh.txt requirements-test.txt': Nowhere('renews the lock, by hand'),
     'rviz2 -d config/rviz/trainer.rviz': PACKAGED,
     'python3 -m venv peers': PEERS,
     'peers/bin/pip install -r requirements.txt -r bench/requirements-peers.txt': PEERS,
-    'peers/bin/python -m bench.peers': PEERS,
+    'peers/bin/python -m bench.accuracy.peers': PEERS,
+    './trainer view --host 0.0.0.0 --allow-host trainer.lan': Nowhere(
+        'opens this machine to others'
+    ),
     'ssh -L 8080:127.0.0.1:8080 trainer': Nowhere('needs a second machine'),
 }
 
@@ -246,16 +271,16 @@ def test_named_script_has_the_command(command: str) -> None:
 def test_script_for_what_takes_long_is_run_by_the_workflow_and_has_no_unknown_command() -> None:
     assert 'bash .ci/commands' in (ROOT / '.github' / 'workflows' / 'ci.yml').read_text()
     subprocess.run(['bash', '-n', str(ROOT / '.ci' / 'commands')], check=True)
-    known = cli_commands() | {'setup'}
+    known = commands_of(cli.app) | {'setup', 'chart', 'validate'}
     for line in scripted():
-        if line.startswith('./trainer '):
+        if line.startswith('./trainer bench '):
+            assert line.split()[2] in commands_of(bench), line
+        elif line.startswith('./trainer '):
             assert line.split()[1] in known, line
 
 
-def cli_commands() -> set[str]:
-    from typer.main import get_command
-
-    return set(get_command(cli.app).commands)
+def commands_of(app: typer.Typer) -> set[str]:
+    return set(get_command(app).commands)
 
 
 def test_what_ros2_is_to_start_is_there_with_its_arguments() -> None:
@@ -281,7 +306,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / 'my_node.py').write_text('import rclpy, cutting_trainer_msgs\nprint("mine")\n')
     (folder / 'largest_force.py').write_text(LARGEST)
     trainer = folder / 'trainer'
-    trainer.write_text(f'#!/bin/sh\nexec {sys.executable} -m session.cli "$@"\n')
+    trainer.write_text(f'#!/bin/sh\nexec {sys.executable} -m cutting_trainer.cli.main "$@"\n')
     trainer.chmod(0o755)
     return folder
 

@@ -20,8 +20,9 @@ from independent_readers import (
     mcap_core,
 )
 
-from bags.reader import open_bag
-from bags.repair import repair_bag
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.repair import repair_bag
 
 pytestmark = pytest.mark.alone
 
@@ -44,8 +45,14 @@ def every_bag(
             continue  # a copy, or what a test has passed off as a bag
         known.add(data)
         folder = path.parent
+        try:
+            bag = open_bag(folder)
+        except BagError:
+            continue  # refused: tests of damage and of lacking files claim that
+        if len(list(folder.glob('*.mcap'))) > 1:
+            continue  # the reader of one file has no other; test_bag_order.py reads several
         if not data.endswith(MAGIC):
-            if not open_bag(folder).span[0]:
+            if not bag.span[0]:
                 continue  # it was cut off before its first chunk was written
             folder = shutil.copytree(folder, mended / str(len(found)) / folder.name)
             assert not repair_bag(folder).whole, path

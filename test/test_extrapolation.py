@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from haptic_bridge import extrapolation as ex
+from cutting_trainer.haptic_bridge import extrapolation as ex
 
 FRAME = 1 / 30
 STIFF = 1e9
@@ -92,7 +92,7 @@ def test_position_law_ignores_motion_across_the_line_of_the_samples():
 
 
 @given(
-    st.floats(0, ex.SHORTEST * 0.999),
+    st.floats(0, ex.MIN_SAMPLE_DISTANCE_M * 0.999),
     st.tuples(*[st.floats(-0.1, 0.1)] * 3),
     st.tuples(*[st.floats(-5, 5)] * 3),
 )
@@ -101,18 +101,18 @@ def test_a_resting_tool_holds_the_last_force(gap, position, force):
     np.testing.assert_array_equal(position_law(position, samples), force)
 
 
-@given(st.floats(-0.1, 0.1), st.floats(1.001 * ex.SHORTEST, 0.02), st.floats(-3, 3))
+@given(st.floats(-0.1, 0.1), st.floats(1.001 * ex.MIN_SAMPLE_DISTANCE_M, 0.02), st.floats(-3, 3))
 def test_position_law_is_bounded_in_reach_and_slope(along, gap, change):
     samples = [([0, 0, 0], [0, 0, 0]), ([gap, 0, 0], [0, 0, change])]
     out = position_law([along, 0, 0], samples, max_stiffness=300.0)
     correction = abs(out[2] - change)
-    assert correction <= ex.FARTHEST * abs(change) * (1 + 1e-9)
+    assert correction <= ex.MAX_EXTRAPOLATION * abs(change) * (1 + 1e-9)
     assert correction <= 300.0 * abs(along - gap) * (1 + 1e-9) + 1e-15
 
 
 def test_time_law_is_bounded_in_reach_and_holds_when_the_clock_stands():
     samples = [(0.0, 0.0), (FRAME, 1.0)]
-    assert time_law(100.0, samples) == pytest.approx(1 + ex.FARTHEST)
+    assert time_law(100.0, samples) == pytest.approx(1 + ex.MAX_EXTRAPOLATION)
     assert time_law(-100.0, samples) == 1.0
     assert time_law(1.0, [(FRAME, 0.0), (FRAME, 1.0)]) == 1.0
 
@@ -177,7 +177,7 @@ def test_stiffness_that_changes_along_the_surface_is_followed_and_not_across_it(
     matrix, depth, force = sloping(k, slope, d)
     for across in (0.0, 2e-3):
         way = np.array([x, across, -across])
-        there = ex.stiffness_on_way(matrix, depth, force, way, 1000.0)
+        there = ex.stiffness_along_path(matrix, depth, force, way, 1000.0)
         assert there == pytest.approx(np.clip(k + slope * x, k / 2, 2 * k))
 
 
@@ -191,7 +191,7 @@ def test_force_between_frames_is_that_of_the_stiffness_where_the_tool_has_come_t
 
 def test_stiffness_on_the_way_is_no_larger_than_what_is_rendered():
     matrix, depth, force = sloping(90.0, 1e4, 4e-3)
-    assert ex.stiffness_on_way(matrix, depth, force, np.array([9e-3, 0, 0]), 120.0) == 120.0
+    assert ex.stiffness_along_path(matrix, depth, force, np.array([9e-3, 0, 0]), 120.0) == 120.0
 
 
 @pytest.mark.parametrize('law', [ex.CONSTANT, ex.TIME])

@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 from live import ROOT
 
-from session.node_process import _Log
-from session.status import Status
-from session.trials.fuzz_messages import KINDS, Maker, huge
-from session.trials.fuzz_verdict import (
-    ALLOWANCE,
-    GROWTH,
-    MOST_LINES,
-    SILENCE,
-    STANDSTILL,
+from bench.trials.fuzz_messages import KINDS, Maker, huge
+from bench.trials.fuzz_verdict import (
+    MAX_LINES_PER_SECOND,
+    MAX_LOOP_PERIOD_S,
+    MAX_MEMORY_GROWTH,
+    MAX_SILENCE_S,
+    MEMORY_ALLOWANCE_MB,
     Node,
     busiest_second,
     problems,
 )
+from cutting_trainer.session.node_process import _Log
+from cutting_trainer.session.status import Status
 
 messages = pytest.importorskip('cutting_trainer_msgs.msg')
 
@@ -34,13 +34,16 @@ def well() -> Node:
 @pytest.mark.parametrize(
     ('change', 'said'),
     [
-        ({'after': GROWTH * 100.0 + ALLOWANCE + 2 * 5.0 + 1.0}, '311 MB at the end'),
-        ({'period': STANDSTILL + 0.1}, 'stood still'),
-        ({'spoke': 10.0 - SILENCE - 1.0}, 'said nothing'),
+        (
+            {'after': MAX_MEMORY_GROWTH * 100.0 + MEMORY_ALLOWANCE_MB + 2 * 5.0 + 1.0},
+            '311 MB at the end',
+        ),
+        ({'period': MAX_LOOP_PERIOD_S + 0.1}, 'stood still'),
+        ({'spoke': 10.0 - MAX_SILENCE_S - 1.0}, 'said nothing'),
         ({'spoke': None}, 'said nothing'),
-        ({'silence': SILENCE + 1.0}, 'said nothing'),
+        ({'silence': MAX_SILENCE_S + 1.0}, 'said nothing'),
         ({'values': {'rate': '30'}}, 'counted nothing'),
-        ({'busiest': MOST_LINES + 1}, 'lines into its log'),
+        ({'busiest': MAX_LINES_PER_SECOND + 1}, 'lines into its log'),
     ],
 )
 def test_a_node_that_is_not_well_is_found(change: dict, said: str) -> None:
@@ -89,11 +92,20 @@ def test_a_message_is_as_huge_as_was_asked_for(name: str) -> None:
     assert 1_000_000 <= len(data) < 1_001_000
 
 
+@pytest.mark.thorough
 @pytest.mark.real_time
 def test_a_session_survives_malformed_messages_floods_and_huge_ones(tmp_path: Path) -> None:
     asked = ('--messages', '10000', '--flood', '0.5', '--largest', '5', '--json')
     done = subprocess.run(
-        [sys.executable, '-m', 'session.cli', 'fuzz', *asked, '--bag', str(tmp_path / 'bag')],
+        [
+            sys.executable,
+            '-m',
+            'bench',
+            'fuzz',
+            *asked,
+            '--bag',
+            str(tmp_path / 'bag'),
+        ],
         cwd=ROOT,
         capture_output=True,
         text=True,

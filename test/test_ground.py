@@ -2,8 +2,8 @@
 
 from flat_tissue import POSITIONS, TRIANGLES
 
-from haptic_bridge.ground import Ground
-from haptic_bridge.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.undented_surface import UndentedSurface
 
 MS = 1_000_000
 
@@ -21,16 +21,16 @@ def lowered(depth, revision, previous=None, topology=1):
 
 def pressed():
     """A ground under a tool, and the dented surface."""
-    ground, first = Ground(), lowered(0.0, 1)
+    ground, first = UndentedSurface(), lowered(0.0, 1)
     ground.follow(0, first)
-    ground.press()
+    ground.freeze()
     dent = lowered(3e-3, 2, first)
     ground.follow(33 * MS, dent)
     return ground, first, dent
 
 
 def test_a_free_tool_follows_the_tissue():
-    ground, first = Ground(), lowered(0.0, 1)
+    ground, first = UndentedSurface(), lowered(0.0, 1)
     ground.follow(0, first)
     moved = lowered(3e-3, 2, first)
     ground.follow(33 * MS, moved)
@@ -65,7 +65,7 @@ def test_after_contact_it_waits_until_the_tissue_has_recovered():
     for k in range(5):  # nobody has said yet that the tool was let go
         ground.follow((66 + k) * MS, dent)
     assert ground.surface is first
-    ground.answered_free(80 * MS, 3)
+    ground.note_free(80 * MS, 3)
     ground.follow(81 * MS, dent)
     back = lowered(1e-3, 3, dent)
     ground.follow(99 * MS, back)
@@ -77,7 +77,7 @@ def test_after_contact_it_waits_until_the_tissue_has_recovered():
 
 def test_a_tissue_that_never_rests_is_followed_after_half_a_second():
     ground, first, dent = pressed()
-    ground.answered_free(50 * MS, 2)
+    ground.note_free(50 * MS, 2)
     surface = dent
     for k in range(3, 30):
         surface = lowered(3e-3 * ((k + 1) % 2), k, surface)

@@ -11,11 +11,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from session.measure.chart_meshes import kuhn_block, pressed
-from tissue_sim.compliance import solve_static
-from tissue_sim.elasticity import ElasticModel, ModelName
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
+from bench.common.meshes import kuhn_block, pressed
+from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 Floats = np.ndarray
 MODULUS, CONTACT, DEPTH = 5000.0, 0.01, 1e-4

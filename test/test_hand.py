@@ -7,17 +7,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from haptic_bridge.arm_settings import ArmSettings, HandSettings
-from haptic_bridge.hand import Hand, compile_script
-from haptic_bridge.settings import SettingsError, Transform
-from tissue_sim.errors import SceneError
-from tissue_sim.scene_file import read_section
+from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
+from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings, HandSettings
+from cutting_trainer.haptic_bridge.settings import SettingsError, Transform
+from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.node_common.scene_file import read_section
 
 
 def hand_on(*phases, seconds=1.0, transform=None, tremor=0.0, seed=0, **start):
     settings_ = ArmSettings.model_validate({'script': script(*phases, seconds=seconds, **start)})
     path = compile_script(settings_.script, transform or Transform())
-    return Hand(HandSettings(tremor=tremor), path, seed)
+    return EmulatedHand(HandSettings(tremor=tremor), path, seed)
 
 
 def test_minimum_jerk_passes_the_middle_at_half_time_with_15_8_of_the_mean_speed():

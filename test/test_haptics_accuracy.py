@@ -1,11 +1,15 @@
 """The force between two frames against a tissue that runs at 1 kHz; the whole table is
-`trainer haptics-accuracy`.
+`trainer bench haptics-accuracy`.
 """
 
 from dataclasses import replace
 
-from session.measure.haptics_accuracy import MOTIONS, PLACES, Bench, measure, missed
-from session.scene import load_scene
+import pytest
+
+from bench.haptics.accuracy import MOTIONS, PLACES, Bench, measure, missed_bounds
+from cutting_trainer.session.scene import load_scene
+
+pytestmark = pytest.mark.long
 
 
 def test_default_keeps_its_bar_while_sliding_at_1_hz_and_holding_the_force_does_not():
@@ -16,7 +20,7 @@ def test_default_keeps_its_bar_while_sliding_at_1_hz_and_holding_the_force_does_
         places=PLACES[1:],
         laws=('local_stiffness', 'constant'),
     )
-    assert missed(rows) == []
+    assert missed_bounds(rows) == []
     default, held = rows
     assert default.peak_newton > 0.2
     assert default.median < held.median

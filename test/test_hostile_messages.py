@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rig import MS, PROFILE, RADIUS, UNIT, K, Rig, pressed
 
-from haptic_bridge.operating_state import State
-from haptic_bridge.surface import Surface
-from haptic_bridge.tissue_sample import TissueSample
-from haptic_bridge.wire import ForceSampleCodec, Sample
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.haptic_bridge.tissue_sample import TissueSample
+from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
+from cutting_trainer.node_common.operating_state import CrtkState
 
 DEPTH = 5e-3
 ODD = st.one_of(
@@ -59,7 +59,7 @@ def test_no_tissue_force_makes_a_force_beyond_the_limits_or_passes_unseen(change
     rig = pressed(ms=60)
     rig.inside, queue, seen = inside, list(changes), []
 
-    def spoil(sample: Sample) -> Sample:
+    def spoil(sample: StampedMessage) -> StampedMessage:
         if not queue:
             return sample
         values = list(sample.values)
@@ -71,16 +71,16 @@ def test_no_tissue_force_makes_a_force_beyond_the_limits_or_passes_unseen(change
 
     rig.spoil, start = spoil, len(rig.ticks)
     for _ in range(len(changes) + 1):
-        rejected = rig.path.refusals.total
+        rejected = rig.path.rejections.total
         rig.run(np.full(33, RADIUS - DEPTH))
-        rig.state = State.ENABLED
+        rig.state = CrtkState.ENABLED
         if seen and seen[-1]:
-            assert rig.path.refusals.total > rejected
+            assert rig.path.rejections.total > rejected
         seen.clear()
     check(rig, start)
     rig.inside = False
     rig.run(np.full(200, RADIUS + 2e-3))
-    rig.state = State.ENABLED
+    rig.state = CrtkState.ENABLED
     rig.run(np.linspace(RADIUS + 1e-3, RADIUS - DEPTH, 100))
     rig.run(np.full(70, RADIUS - DEPTH))
     assert rig.forces[-1][2] == pytest.approx(K * DEPTH, rel=1e-3)
@@ -98,7 +98,7 @@ def test_a_number_that_cannot_be_is_a_fault_in_every_field_that_makes_the_force(
     )
     rig.run(np.full(40, RADIUS - DEPTH))
     unused = field in ('kinetic_energy', 'elastic_energy')
-    assert rig.state is (State.ENABLED if unused else State.FAULT)
+    assert rig.state is (CrtkState.ENABLED if unused else CrtkState.FAULT)
     assert unused or field in next(tick.fault for tick in rig.ticks if tick.fault)
     assert unused == bool(np.any(rig.forces[-1]))
 
@@ -111,7 +111,7 @@ def test_a_contact_state_that_does_not_exist_is_a_fault(state):
         values=(*sample.values[:slot], state, *sample.values[slot + 1 :])
     )
     rig.run(np.full(40, RADIUS - DEPTH))
-    assert rig.state is State.FAULT
+    assert rig.state is CrtkState.FAULT
 
 
 def test_a_blade_that_pushes_with_a_negative_resistance_is_a_fault():
@@ -122,7 +122,7 @@ def test_a_blade_that_pushes_with_a_negative_resistance_is_a_fault():
         values=(*sample.values[:slot], -1.0, *sample.values[slot + 1 :])
     )
     rig.run(np.full(40, RADIUS - DEPTH))
-    assert rig.state is State.FAULT
+    assert rig.state is CrtkState.FAULT
     assert not np.any(rig.forces[-1])
 
 
@@ -146,7 +146,7 @@ def test_no_pose_makes_a_force_beyond_the_limits(poses):
             values[slot] = value
         rig.tick(values[:3], values[3:], max(rig.now + MS + shift, 0) or None)
         rig.run(np.full(3, RADIUS - DEPTH))
-        rig.state = State.ENABLED
+        rig.state = CrtkState.ENABLED
     check(rig, start)
 
 

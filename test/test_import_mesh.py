@@ -9,20 +9,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from cutting.methods import make_method
-from haptic_bridge.force_path import ForcePath
-from haptic_bridge.hand import compile_script
-from session.errors import SessionError
-from session.in_process import InProcess, Tissue
-from session.measure.chart_meshes import kuhn_block
-from session.organs import mesher
-from session.organs.import_mesh import SIDES, ImportOptions, import_mesh
-from session.organs.imported_scene import height
-from session.organs.surface_import import read_surface
-from session.scene import load_scene
-from session.status import Status
-from tissue_sim.assembly import make_simulation
-from tissue_sim.contact import State
+from bench.common.meshes import kuhn_block
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.mesh_import import mesher
+from cutting_trainer.mesh_import.import_mesh import SIDES, ImportOptions, import_mesh
+from cutting_trainer.mesh_import.imported_scene import height
+from cutting_trainer.mesh_import.surface_import import read_surface
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.in_process import InProcess, Tissue
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.status import Status
+from cutting_trainer.tissue_sim.assembly import make_simulation
+from cutting_trainer.tissue_sim.contact.tool import ContactState
+
+pytestmark = pytest.mark.long
 
 BODY = trimesh.creation.icosphere(subdivisions=3, radius=30.0)
 BODY.apply_scale([1.3, 1.0, 0.6])
@@ -178,7 +180,7 @@ def test_missing_file_and_huge_surface_are_refused(
     path = saved(tmp_path, BODY)
     with pytest.raises(SessionError, match=r'did you mean organ\.stl'):
         read_surface(tmp_path / 'orgn.stl', 'mm')
-    monkeypatch.setattr('session.organs.surface_import.MOST_TRIANGLES', 100)
+    monkeypatch.setattr('cutting_trainer.mesh_import.surface_import.MAX_TRIANGLES', 100)
     with pytest.raises(SessionError, match='simplify it'):
         read_surface(path, 'mm')
 
@@ -236,7 +238,7 @@ def test_mesh_is_numbered_so_that_neighbours_lie_near_one_another() -> None:
     mesh, random = kuhn_block((12, 12, 12), (0.1, 0.1, 0.1)), np.random.default_rng(0)
     n, order = mesh.node_count, random.permutation(mesh.node_count)
     shuffled = random.permutation(np.argsort(order)[mesh.tetrahedra].astype(np.int32))
-    nodes, tetrahedra = mesher.near_together(mesh.rest[order], shuffled)
+    nodes, tetrahedra = mesher.reorder_nodes(mesh.rest[order], shuffled)
     assert np.array_equal(np.unique(nodes, axis=0), np.unique(mesh.rest, axis=0))
     before, after = mesh.rest[order][shuffled], nodes[tetrahedra]
     ours, theirs = after.mean(axis=1), before.mean(axis=1)  # no two are alike
@@ -252,7 +254,14 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     """A body imported, resting on its side +x; the scene and the report."""
     folder = tmp_path_factory.mktemp('organ')
     surface = saved(folder, without(17))
-    command = [sys.executable, '-m', 'session.cli', 'import-mesh', str(surface), '--json']
+    command = [
+        sys.executable,
+        '-m',
+        'cutting_trainer.cli.main',
+        'import-mesh',
+        str(surface),
+        '--json',
+    ]
     command += ['--edge', '0.009', '-o', str(folder / 'mine')]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == Status.OK, done.stderr
@@ -310,7 +319,7 @@ def test_imported_scene_is_pressed_and_cut_by_its_own_script(
         )
         session.tick(position)
         forces.append(session.path.force_norm)
-        if tissue.simulation.state == State.INSIDE and not entered:
+        if tissue.simulation.state == ContactState.INSIDE and not entered:
             entered = tick
         assert session.frame is None or not session.frame.diverged
     cut = tissue.simulation.mesh.triangle_kind.sum()
@@ -325,8 +334,8 @@ def test_imported_scene_is_pressed_and_cut_by_its_own_script(
 
 @pytest.mark.parametrize('side', SIDES)
 def test_side_on_which_it_rests_is_turned_down_without_mirroring(side: str) -> None:
-    from session.organs.import_mesh import _placed
-    from session.organs.surface_import import Surface
+    from cutting_trainer.mesh_import.import_mesh import _placed
+    from cutting_trainer.mesh_import.surface_import import Surface
 
     box = trimesh.creation.box([0.04, 0.05, 0.06])
     axis, sign = SIDES[side]
@@ -355,5 +364,5 @@ def test_output_that_exists_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / 'made.yaml').write_text('mine')
     with pytest.raises(SessionError, match='exists'):
         import_mesh(options(surface, tmp_path / 'made'))
-    with pytest.raises(SessionError, match='without an ending'):
+    with pytest.raises(SessionError, match='without an extension'):
         import_mesh(options(surface, tmp_path / 'made.msh'))

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from meshes import box, irregular_box
 
-from tissue_sim.coupling import HOLD, PUSH, Coupling
-from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.elasticity import MODELS, ElasticModel, ModelName
-from tissue_sim.integrators import INTEGRATORS, Integrator, IntegratorName
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
-from tissue_sim.stability import amplification, step_bound
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, PUSH, Coupling
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, Integrator, IntegratorName
+from cutting_trainer.tissue_sim.motion.stability import amplification, step_bound
 
 EXPLICIT = tuple(name for name in INTEGRATORS if name != 'implicit')
 every_integrator = pytest.mark.parametrize('integrator', INTEGRATORS)

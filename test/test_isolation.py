@@ -11,9 +11,9 @@ from shutil import which
 import pytest
 from live import ROOT, free_domain, two_presses, write_scene
 
-from bench.impaired_link import TwoHosts, missing_rights
-from session.graph import MODULES, node_environment
-from session.network import Network, network_environment
+from bench.graph.impaired_link import TwoHosts, missing_rights
+from cutting_trainer.session.graph import MODULES, node_environment
+from cutting_trainer.session.network import Network, network_environment
 
 pytest.importorskip('rclpy')
 pytestmark = [
@@ -27,8 +27,9 @@ import json, sys, time
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
-from haptic_bridge.operating_state import crtk_types
-from tissue_sim.ros import EVENTS, LATCHED, NEWEST_BEST_EFFORT, polled, take, take_raw
+from cutting_trainer.node_common.operating_state import crtk_types
+from cutting_trainer.node_common.ros import EVENTS, LATCHED, NEWEST_BEST_EFFORT
+from cutting_trainer.node_common.ros import polled, take, take_raw
 rclpy.init()
 node, types = Node('stranger'), crtk_types()
 poses = polled(node, PoseStamped, 'arm/measured_cp', NEWEST_BEST_EFFORT)
@@ -96,6 +97,7 @@ def on_the_network(domain: int, hosts: TwoHosts, other: int) -> dict[str, str]:
     return node_environment(domain) | network.variables(os.environ)
 
 
+@pytest.mark.thorough
 def test_on_the_network_an_arm_is_heard_and_obeys(hosts: TwoHosts, tmp_path: Path) -> None:
     domain = free_domain()
     arms, strangers = (on_the_network(domain, hosts, other) for other in (1, 0))
@@ -114,6 +116,7 @@ def test_by_default_another_host_hears_nothing_and_is_not_heard(
     assert got['own']['state'] == 'ENABLED'
 
 
+@pytest.mark.thorough
 def test_another_domain_hears_nothing_and_is_not_heard(hosts: TwoHosts, tmp_path: Path) -> None:
     domain = free_domain()
     got = found(hosts, tmp_path, node_environment(domain), node_environment(domain + 1), 0)
@@ -121,6 +124,7 @@ def test_another_domain_hears_nothing_and_is_not_heard(hosts: TwoHosts, tmp_path
     assert got['own']['state'] == 'ENABLED'
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(('theirs', 'same'), [('lab_b', False), ('lab_a', True), ('', False)])
 def test_another_partition_hears_nothing_and_is_not_heard(
     hosts: TwoHosts, tmp_path: Path, theirs: str, same: bool
@@ -135,6 +139,7 @@ def test_another_partition_hears_nothing_and_is_not_heard(
     assert got['own']['state'] == ('DISABLED' if same else 'ENABLED')
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not which('fast-discovery-server'), reason='no fast-discovery-server')
 def test_hosts_find_each_other_by_a_discovery_server(hosts: TwoHosts, tmp_path: Path) -> None:
     address = hosts.addresses[1]

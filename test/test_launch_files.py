@@ -4,11 +4,12 @@ import re
 import sys
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
-from session.graph import MODULES, PROFILES, RANGE, node_environment, session_nodes
+from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.session.graph import MODULES, PROFILES, RANGE, node_environment, session_nodes
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -34,12 +35,12 @@ def launch_description(monkeypatch: pytest.MonkeyPatch, name: str = 'trainer') -
         for each in classes:
             setattr(module, each, type(each, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, module_name, module)
-    monkeypatch.delitem(sys.modules, 'session.launching', raising=False)
+    monkeypatch.delitem(sys.modules, 'cutting_trainer.session.launching', raising=False)
     namespace: dict[str, Any] = {'__name__': f'{name}_launch'}
     path = ROOT / 'launch' / f'{name}.launch.py'
     exec(compile(path.read_text(), str(path), 'exec'), namespace)
     (entities,) = namespace['generate_launch_description']().args
-    sys.modules.pop('session.launching', None)  # its classes are those recorders
+    sys.modules.pop('cutting_trainer.session.launching', None)  # its classes are those recorders
     return entities
 
 
@@ -69,11 +70,13 @@ def test_the_bridge_finds_all_of_a_device_in_its_namespace(
     (bridge,) = of_kind(launch_description(monkeypatch, 'bridge'), 'Node')
     remapped = {topic for topic, _ in bridge.kwargs['remappings']}
     text = ''.join(
-        (ROOT / path).read_text() for path in ('haptic_bridge/node.py', 'haptic_bridge/crtk.py')
+        (ROOT / path).read_text() for path in ('haptic_bridge/node.py', 'node_common/crtk.py')
     )
     named = set(re.findall(r"\{(?:ros\.ARM|name)\}/(\w+)'", text)) - {'state_command'}
-    assert {'measured_cp', 'servo_cf', 'operating_state', 'button'} <= named
-    assert {f'arm/{topic}' for topic in named} <= remapped
+    assert {'measured_cp', 'operating_state', 'button'} <= named
+    forces = get_args(DeviceSettings.model_fields['force_topic'].annotation)
+    assert {'servo_cf', 'body/servo_cf', 'spatial/servo_cf'} == set(forces)
+    assert {f'arm/{topic}' for topic in (*named, *forces)} <= remapped
 
 
 @pytest.mark.parametrize('name', LAUNCH_FILES)
@@ -148,6 +151,8 @@ def test_bridge_and_simulation_side_make_one_graph_without_the_arm(
     (node,) = of_kind(sides[0], 'Node')
     remapped = dict(node.kwargs['remappings'])
     assert {'arm/measured_cp', 'arm/servo_cf'} <= remapped.keys()
+    device, *chosen = remapped.pop('arm/servo_cf')
+    assert device.args == ('arm',) and chosen[0] == '/' and chosen[1].args == ('force_topic',)
     for before, (device, after) in remapped.items():
         assert device.args == ('arm',) and before == f'arm{after}'
     defaults = {
@@ -172,7 +177,7 @@ def test_replay_passes_options_that_the_command_has(
 ) -> None:
     from typer.testing import CliRunner
 
-    from session.cli import app
+    from cutting_trainer.cli.main import app
 
     shown = CliRunner().invoke(app, ['replay', '--help'], env={'COLUMNS': '200'}).output
     for process in of_kind(launch_description(monkeypatch, name), 'ExecuteProcess'):

@@ -5,6 +5,7 @@ import fcntl
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,11 +18,8 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from typer.main import get_command
 
-from session.cli import app
-
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -40,8 +38,9 @@ def load(script: Path) -> ModuleType:
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """A clone with all that the launcher itself reads."""
-    for name in ('session', 'tissue_sim', 'haptic_bridge', 'cutting', 'msg_defs'):
+    for name in ('cli', 'session', 'tissue_sim', 'haptic_bridge', 'cutting', 'msg_defs'):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns('__pycache__'))
+    shutil.copytree(ROOT / 'cutting_trainer', tmp_path / 'cutting_trainer', symlinks=True)
     for path in [ROOT / 'trainer', *ROOT.glob('requirements*.txt')]:
         shutil.copy(path, tmp_path)
     return tmp_path
@@ -70,20 +69,52 @@ def executable(path: Path, text: str) -> Path:
     return path
 
 
-def test_help_names_every_command_and_sets_nothing_up(tree: Path) -> None:
+def test_help_names_what_there_is_before_anything_is_set_up(tree: Path) -> None:
     done = start(tree, '--help')
     assert done.returncode == 0
-    shown = [line.split()[0] for line in done.stdout.splitlines() if line[:2] == '  ']
-    assert shown == [*get_command(app).commands, 'setup', 'clean']
+    shown = {line.split()[0] for line in done.stdout.splitlines() if line[:2] == '  '}
+    assert shown == {'demo', 'setup', 'overlay', 'doctor', 'bench', 'chart', 'validate', 'clean'}
     assert not (tree / '.trainer').exists()
 
 
-def test_unknown_command_is_refused_before_anything_is_set_up(tree: Path) -> None:
-    done = start(tree, 'dmeo')
-    assert done.returncode == 2
-    assert done.stderr == "error: there is no command 'dmeo': did you mean demo?\n"
-    assert 'import-mesh, doctor' in start(tree, 'xyz').stderr
-    assert not (tree / '.trainer').exists()
+@pytest.mark.parametrize(
+    ('arguments', 'module'),
+    [
+        (['demo', '--scene', 'block'], ['cutting_trainer.cli', 'demo', '--scene', 'block']),
+        (['bench', 'force'], ['bench', 'force']),
+        (['chart', '-o', 'x'], ['bench', 'chart', '-o', 'x']),
+        (['validate', 'sphere'], ['bench', 'validate', 'sphere']),
+    ],
+)
+def test_command_goes_to_the_module_that_has_it(
+    launcher: Any, monkeypatch: pytest.MonkeyPatch, arguments: list[str], module: list[str]
+) -> None:
+    monkeypatch.setattr(launcher, 'prepare', lambda home, **_: None)
+    monkeypatch.setattr(launcher.os, 'execve', lambda file, words, env: words)
+    assert launcher.main(arguments)[1:] == ['-m', *module]
+
+
+def test_pip_settings_are_passed_on_to_uv_and_the_environment_overrides_files(
+    launcher: Any,
+) -> None:
+    listed = (
+        ":env:.index-url='https://a.example/simple'\n:env:.no-input='1'\n"
+        "global.index-url='https://b.example/simple'\nglobal.trusted-host='b.example'\n"
+        "install.extra-index-url='https://c.example https://d.example'\n"
+    )
+    assert launcher.uv_settings(listed) == {
+        'UV_DEFAULT_INDEX': 'https://a.example/simple',
+        'UV_INSECURE_HOST': 'b.example',
+        'UV_INDEX': 'https://c.example https://d.example',
+    }
+
+
+def test_lock_has_a_hash_of_every_package_and_names_no_host() -> None:
+    for name in ('requirements-lock.txt', 'requirements-uv.txt'):
+        text = (ROOT / name).read_text()
+        pinned = re.findall(r'^[\w.-]+==.*$', text, re.MULTILINE)
+        assert pinned and all(line.endswith('\\') for line in pinned)
+        assert '//' not in text and '--index' not in text and '--find' not in text
 
 
 def test_python_3_6_can_read_the_launcher() -> None:
@@ -317,6 +348,10 @@ def test_nodes_stay_on_this_machine_unless_the_user_says_otherwise(launcher: Any
 # Each step once.
 
 
+KERNELS = {'compile_kernels', 'compile_further_kernels'}
+ALL = {'make_environment', 'build_interfaces', 'build_overlay'} | KERNELS
+
+
 @pytest.fixture
 def steps(launcher: Any, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the steps that are done, each only noted here."""
@@ -330,23 +365,32 @@ def steps(launcher: Any, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
         return action
 
-    for name in ('make_environment', 'build_interfaces', 'compile_kernels'):
+    for name in ALL:
         monkeypatch.setattr(launcher, name, note(name))
     return done
 
 
-ALL = ['make_environment', 'build_interfaces', 'compile_kernels']
-
-
-def prepared(launcher: Any, steps: list[str]) -> list[str]:
+def prepared(launcher: Any, steps: list[str]) -> set[str]:
     steps.clear()
     launcher.prepare(launcher.find_home({}))
-    return list(steps)
+    assert len(steps) == len(set(steps))
+    return set(steps)
 
 
 def test_second_start_does_nothing(launcher: Any, steps: list[str]) -> None:
     assert prepared(launcher, steps) == ALL
-    assert prepared(launcher, steps) == []
+    assert prepared(launcher, steps) == set()
+
+
+def test_demo_does_not_wait_for_kernels_that_only_other_methods_need(
+    launcher: Any, steps: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launcher.os, 'execve', lambda *_: 0)
+    launcher.main(['demo'])
+    assert set(steps) == ALL - {'compile_further_kernels'}
+    steps.clear()
+    launcher.main(['test'])
+    assert steps == ['compile_further_kernels']
 
 
 def test_each_change_redoes_the_steps_that_depend_on_it(
@@ -355,10 +399,10 @@ def test_each_change_redoes_the_steps_that_depend_on_it(
     prepared(launcher, steps)
     with (tree / 'msg_defs' / 'msg' / 'Mesh.msg').open('a') as file:
         file.write('\n# changed\n')
-    assert prepared(launcher, steps) == ['build_interfaces']
+    assert prepared(launcher, steps) == {'build_interfaces'}
     kernel = launcher.kernel_files()[0]
     os.utime(kernel, (1, 1))
-    assert prepared(launcher, steps) == ['compile_kernels']
+    assert prepared(launcher, steps) == KERNELS
     with (tree / 'requirements-ros.txt').open('a') as file:
         file.write('\n# changed\n')
     assert prepared(launcher, steps) == ALL
@@ -369,11 +413,23 @@ def test_module_from_which_a_kernel_takes_constants_counts_as_a_kernel(
 ) -> None:
     (tree / 'cutting' / 'constants.py').write_text('LIMIT = 1\n')
     kernel = tree / 'cutting' / 'kernel.py'
-    kernel.write_text('from cutting.constants import LIMIT\nfrom numba import njit\n')
+    kernel.write_text(
+        'from cutting_trainer.cutting.constants import LIMIT\n'
+        'from cutting_trainer.node_common.kernels import inner\n'
+    )
     assert {tree / 'cutting' / 'constants.py', kernel} <= set(launcher.kernel_files())
 
 
-@pytest.mark.parametrize('interrupted', ALL)
+BEFORE = {
+    'make_environment': set(),
+    'build_interfaces': {'make_environment'},
+    'build_overlay': {'make_environment', 'build_interfaces'},
+    'compile_kernels': {'make_environment'},
+    'compile_further_kernels': {'make_environment', 'compile_kernels'},
+}
+
+
+@pytest.mark.parametrize('interrupted', sorted(ALL))
 def test_interrupted_step_is_done_again_and_the_ones_before_it_are_not(
     launcher: Any, steps: list[str], monkeypatch: pytest.MonkeyPatch, interrupted: str
 ) -> None:
@@ -385,8 +441,40 @@ def test_interrupted_step_is_done_again_and_the_ones_before_it_are_not(
     monkeypatch.setattr(launcher, interrupted, interrupt)
     assert launcher.guarded_main(['setup']) == launcher.INTERRUPTED
     monkeypatch.setattr(launcher, interrupted, whole)
-    assert prepared(launcher, steps) == ALL[ALL.index(interrupted) :]
-    assert prepared(launcher, steps) == []
+    redone = prepared(launcher, steps)
+    assert interrupted in redone and not redone & BEFORE[interrupted]
+    assert prepared(launcher, steps) == set()
+
+
+def test_python_of_an_environment_stands_for_the_one_that_it_was_made_of(
+    launcher: Any, tmp_path: Path
+) -> None:
+    subprocess.run([sys.executable, '-m', 'venv', '--without-pip', tmp_path / 'env'], check=True)
+    facts = launcher.probe(str(tmp_path / 'env' / 'bin' / 'python'))
+    assert not Path(facts['executable']).is_relative_to(tmp_path)
+
+
+def test_messages_are_built_once_for_all_clones(
+    launcher: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    home, built = launcher.find_home({}), []
+
+    def build(home: Any, lock: int, step: str, source: Path, prefix: Path) -> None:
+        built.append(step)
+        executable(prefix / 'lib' / 'messages', 'built')
+
+    monkeypatch.setattr(launcher, 'check_build_tools', lambda: None)
+    monkeypatch.setattr(launcher, 'build_package', build)
+    (home.environment / 'lib' / 'python3.12').mkdir(parents=True)
+    for _ in range(2):
+        launcher.build_interfaces(home, 0)
+        assert (home.install / 'lib' / 'messages').read_text() == 'built'
+        shutil.rmtree(home.install)
+    assert built == ['interfaces']
+    (home.environment / 'lib' / 'python3.12').rename(home.environment / 'lib' / 'python3.13')
+    launcher.build_interfaces(home, 0)
+    assert len(built) == 2
 
 
 def test_second_start_waits_for_the_first(tree: Path) -> None:
@@ -410,7 +498,7 @@ loader = SourceFileLoader('launcher', 'trainer')
 launcher = importlib.util.module_from_spec(importlib.util.spec_from_loader('launcher', loader))
 loader.exec_module(launcher)
 def endless(home, lock):
-    run = ['sh', '-c', 'echo $$ > pid; exec sleep 600']
+    run = ['sh', '-c', 'sh -c "echo \\$\\$ > pid; exec sleep 600"; true']
     launcher.run(home, lock, 'environment', [run], launcher.os.environ)
 launcher.make_environment = endless
 launcher.signal.signal(launcher.signal.SIGTERM, launcher.on_signal)
@@ -432,7 +520,19 @@ def test_interrupt_during_setup_ends_the_running_step(tree: Path, number: signal
     said = setup.communicate(timeout=20)[1]
     assert setup.returncode == 130
     assert 'Interrupted' in said
-    assert not Path(f'/proc/{pid.read_text().strip()}').exists()
+    stat = Path(f'/proc/{pid.read_text().strip()}/stat')
+    deadline = time.monotonic() + 20
+    while runs(stat) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not runs(stat)
+
+
+def runs(stat: Path) -> bool:
+    """Return whether a process runs: one that ended stays listed until its parent looks."""
+    try:
+        return stat.read_text().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
 
 
 def test_clean_leaves_nothing_but_the_lock(tree: Path) -> None:

@@ -17,9 +17,9 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from live import ROOT, free_domain, two_presses, wait_for, write_scene
 from rclpy.node import Node
 
-from haptic_bridge.wire import WrenchStampedCodec
-from session.graph import MODULES, node_environment
-from tissue_sim.ros import NEWEST_BEST_EFFORT, polled, take_raw
+from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
+from cutting_trainer.node_common.ros import NEWEST_BEST_EFFORT, polled, take_raw
+from cutting_trainer.session.graph import MODULES, node_environment
 
 pytestmark = pytest.mark.real_time
 

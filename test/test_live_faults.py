@@ -44,11 +44,11 @@ from live import (
 )
 from rosbags.highlevel import AnyReader
 
-from bags.reader import Recorded, open_bag
-from bags.repair import repair_bag
-from haptic_bridge.wire import ForceSampleCodec, PoseStampedCodec
-from session.graph import node_environment
-from session.status import Status
+from cutting_trainer.bags.reader import Recorded, open_bag
+from cutting_trainer.bags.repair import repair_bag
+from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec
+from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.status import Status
 
 pytestmark = pytest.mark.real_time
 
@@ -92,7 +92,7 @@ def witness(tmp_path: Path, domain: int) -> Iterator['subprocess.Popen[str]']:
     """Another recorder in the domain of the session, ready to hear."""
     arguments = ['-r', '__node:=witness', '-p', f'bag:={tmp_path / "seen"}']
     witness = subprocess.Popen(
-        [sys.executable, '-m', 'bags.node', '--ros-args', *arguments],
+        [sys.executable, '-m', 'cutting_trainer.bags.node', '--ros-args', *arguments],
         cwd=ROOT,
         env=node_environment(domain),
         stdout=subprocess.PIPE,
@@ -179,12 +179,14 @@ def test_arm_lets_go_by_itself_and_the_tissue_comes_to_rest_when_the_bridge_dies
     assert is_complete(session.bag)
 
 
+@pytest.mark.thorough
 def test_palpation_goes_on_undisturbed_when_cutting_dies(session: LiveSession, kill: Kill) -> None:
     fault = kill('cutting')
     assert_undisturbed(fault)
     assert is_complete(session.bag)
 
 
+@pytest.mark.thorough
 def test_palpation_goes_on_undisturbed_when_the_recorder_dies(
     witness: 'subprocess.Popen[str]',
     session: LiveSession,
@@ -203,6 +205,7 @@ def test_palpation_goes_on_undisturbed_when_the_recorder_dies(
     assert norms[-1] > PRESSING or last < fault.killed - STEADY  # from before it was pressed
 
 
+@pytest.mark.thorough
 def test_force_fades_and_comes_back_when_the_tissue_is_frozen_and_goes_on(
     session: LiveSession,
 ) -> None:
@@ -257,6 +260,7 @@ def end(witness: 'subprocess.Popen[str]') -> None:
     assert witness.returncode == 0
 
 
+@pytest.mark.thorough
 def test_session_goes_on_when_the_disk_is_full_and_says_what_is_not_in_the_bag(
     tmp_path: Path, domain: int
 ) -> None:
@@ -267,7 +271,7 @@ def test_session_goes_on_when_the_disk_is_full_and_says_what_is_not_in_the_bag(
     if not shutil.which('unshare') or subprocess.run([*namespace, mount], check=False).returncode:
         pytest.skip('no disk of its own: this system lets users mount nothing')
     scene = ROOT / 'bags' / 'samples' / 'straight_cut.yaml'
-    demo = [sys.executable, '-m', 'session.cli', 'demo', '--domain', str(domain)]
+    demo = [sys.executable, '-m', 'cutting_trainer.cli', 'demo', '--domain', str(domain)]
     words = shlex.join([*demo, '--scene', str(scene), '--bag', str(disk / 'bag')])
     done = subprocess.run(
         [*namespace, f'{mount} && {words}; status=$?; cp -r {disk}/bag {bag}; exit $status'],

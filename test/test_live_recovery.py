@@ -25,9 +25,9 @@ from live import (
     write_scene,
 )
 
-from session.graph import node_environment
+from cutting_trainer.session.graph import node_environment
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
 SECONDS = 200.0
 """Longer than it takes, even on a busy machine: the test interrupts the session."""

@@ -28,23 +28,24 @@ from live import (
 )
 from rosbags.highlevel import AnyReader
 
-from bags.comparison import compare
-from bags.frames import read_frames
-from bags.metadata import read_metadata
-from bags.reader import open_bag
-from bags.topics import CUTS, DIAGNOSTICS
-from haptic_bridge.settings import DeviceSettings
-from haptic_bridge.wire import (
+from cutting_trainer.bags.comparison import compare
+from cutting_trainer.bags.frames import read_frames
+from cutting_trainer.bags.metadata import read_metadata, recorded_code
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.topics import CUTS, DIAGNOSTICS
+from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
     WrenchStampedCodec,
 )
-from session.recordings.recorded_scene import restore_scene
-from session.recordings.resimulate import pose_check, recomputation
-from session.scene import load_scene
-from session.status import Status
-from tissue_sim.replica import MeshReplica
+from cutting_trainer.node_common.code_identity import identity_here
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate import pose_check, recomputation
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.status import Status
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
 pytestmark = pytest.mark.real_time
 
@@ -80,7 +81,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSession]:
         phase('rest', share=1.5),
     ]
     session = LiveSession(
-        folder, write_scene(folder, phases, SECONDS, cut_threshold=0.6), free_domain()
+        folder, write_scene(folder, phases, SECONDS, cut_threshold=0.2), free_domain()
     )
     yield session
     session.clean()
@@ -88,9 +89,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSession]:
 
 @pytest.fixture(scope='module')
 def recording(session: LiveSession) -> Recording:
-    status = session.end()
-    print(session.said)
-    assert status == Status.OK, session.said
+    assert not session.complaints(), session.said
     return Recording(session.bag)
 
 
@@ -116,7 +115,7 @@ def test_bag_of_a_session_holds_scene_seed_versions_parameters_and_service_calls
 ) -> None:
     about = recording.bag.custom_data
     assert about['scene'] == session.scene.read_text() and about['scene_file'] == session.scene.name
-    assert about['seed'] == '0' and about['trainer_version'] and about['numpy_version']
+    assert about['seed'] == '0' and recorded_code(about) == identity_here()
     parameters = yaml.safe_load(about['parameters'])
     assert parameters.keys() >= {f'/{node}' for node in NODES}
     assert parameters['/haptic_bridge']['auto_enable'] is True
@@ -163,8 +162,8 @@ def test_force_rises_with_depth_on_the_way_in_of_each_palpation(recording: Recor
         inside = np.flatnonzero((times >= start) & (times <= end))
         way_in = inside[: 1 + np.argmin(heights[inside])]
         depth, force = heights[way_in[0]] - heights[way_in], forces[way_in, 2]
-        assert depth[-1] > 1e-3 and force[-1] > 0.1
-        correlation = np.corrcoef(depth, force)[0, 1]
+        assert depth[-1] > 1e-3 and force[-1] > 0.05
+        correlation = np.corrcoef(depth**1.5, force)[0, 1]  # Hertz: a sphere on elastic tissue
         print(f'correlation {correlation:.4f} to {depth[-1] * 1e3:.2f} mm')
         assert correlation > 0.98
         answered = force[times[way_in] > start + ANSWERED]
@@ -210,23 +209,23 @@ def test_every_message_of_the_bag_is_counted_and_understood_by_rosbags(
     assert counts[SERVO_CF] > 1000 * SECONDS / 2
 
 
-def test_deltas_lead_from_the_first_keyframe_to_the_arrays_of_a_later_one_bit_for_bit(
+def test_deltas_lead_from_the_first_keyframe_to_the_arrays_of_each_later_one_bit_for_bit(
     recording: Recording,
 ) -> None:
-    keyframes = [recording.bag.read(message) for message in recording.messages('/tissue/mesh')]
-    later = keyframes[-1]
+    first, *others = (recording.bag.read(message) for message in recording.messages('/tissue/mesh'))
+    later = {mesh.revision: mesh for mesh in others if mesh.revision > first.revision}
+    assert later
     replica = MeshReplica()
-    replica.load(keyframes[0])
-    assert replica.hash() == keyframes[0].state_hash
+    replica.load(first)
+    assert replica.hash() == first.state_hash
     for delta in map(recording.bag.read, recording.messages('/tissue/mesh_updates')):
         assert replica.apply(delta)
         if delta.state_hash:
             assert replica.hash() == delta.state_hash
-        if delta.revision == later.revision:
-            break
-    assert replica.revision == later.revision > keyframes[0].revision
-    assert later.topology == delta.topology > keyframes[0].topology
-    assert replica.hash() == later.state_hash
+        if mesh := later.pop(delta.revision, None):
+            assert (replica.topology, replica.hash()) == (mesh.topology, mesh.state_hash)
+    assert not later
+    assert replica.topology > first.topology
 
 
 MOMENTS = {
@@ -276,6 +275,7 @@ def test_interrupt_ends_every_process_and_closes_the_bag(
         assert set(NODES) == {path.stem for path in (interrupted.bag / 'log').iterdir()}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize('pause', [0.0, 0.3])
 def test_second_interrupt_leaves_nothing_either(interrupted: LiveSession, pause: float) -> None:
     interrupted.wait_until_pressed(PRESSING)
@@ -286,6 +286,7 @@ def test_second_interrupt_leaves_nothing_either(interrupted: LiveSession, pause:
     assert Recording(interrupted.bag).complete
 
 
+@pytest.mark.thorough
 def test_interrupt_while_the_bag_is_read_at_the_end_is_an_interrupt_as_any(
     interrupted: LiveSession,
 ) -> None:

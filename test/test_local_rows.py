@@ -5,11 +5,11 @@ import pytest
 from meshes import irregular_box
 from test_active_region import palpated
 
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.elasticity import ElasticModel, ModelName, internal_force
-from tissue_sim.integrators import IntegratorName
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName, internal_force
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 
 SOFT = Material(3000.0, 0.45, 1000.0)
 

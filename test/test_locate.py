@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tissue_sim.locate import closest_triangle, distance_to_triangles
+from cutting_trainer.tissue_sim.mesh.locate import closest_triangle, distance_to_triangles
 
 coordinate = st.integers(-4, 4).map(lambda k: 0.01 * k)
 """On a lattice: points lie in planes, edges and corners of triangles, and as far from several."""

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from meshes import irregular_box
 
-from tissue_sim.elasticity import ElasticModel
-from tissue_sim.errors import MeshError
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, TopologyDelta
-from tissue_sim.replica import MeshReplica, state_hash
-from tissue_sim.topology import CUT, OUTER
+from cutting_trainer.node_common.errors import MeshError
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica, state_hash
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.mesh.topology import CUT, OUTER
 
 MATERIAL = Material(5000.0, 0.45, 1000.0)
 
@@ -191,7 +191,7 @@ def as_message(mesh: TetMesh, displacement: np.ndarray, revision: int) -> Simple
 
 
 def test_a_replica_that_follows_the_deltas_has_the_same_bits() -> None:
-    messages = pytest.importorskip('tissue_sim.messages')
+    messages = pytest.importorskip('cutting_trainer.tissue_sim.streaming.messages')
     rng = np.random.default_rng(0)
     mesh = TetMesh(*irregular_box((2, 2, 2), 0.01, 3))
     u = np.zeros_like(mesh.rest)
@@ -220,14 +220,16 @@ def test_a_replica_that_follows_the_deltas_has_the_same_bits() -> None:
 def test_of_a_large_tissue_only_the_whole_mesh_carries_a_hash(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    messages = pytest.importorskip('tissue_sim.messages', reason='needs ROS')
+    messages = pytest.importorskip(
+        'cutting_trainer.tissue_sim.streaming.messages', reason='needs ROS'
+    )
     mesh = TetMesh(*irregular_box((2, 2, 2), 0.01, 3))
     u = np.zeros_like(mesh.rest)
     replica = MeshReplica()
     replica.load(as_message(mesh, u, 0))
     encoder = messages.DeltaEncoder(mesh, u)
     for most in (len(mesh.tetrahedra), 10):
-        monkeypatch.setattr(messages, '_HASHED', most)
+        monkeypatch.setattr(messages, '_MAX_HASHED_TETRAHEDRA', most)
         touched = mesh.apply(TopologyDelta(removed_tetrahedra=np.array([0])))
         delta = encoder.encode(u, 1, 0, touched, 1)
         assert replica.apply(delta)

@@ -12,17 +12,20 @@ from live import free_domain, wait_for
 from meshes import irregular_box
 from rclpy.node import Node
 
-from tissue_sim import ros
-from tissue_sim.link_budget import LinkBudget
-from tissue_sim.mesh import TetMesh
-from tissue_sim.mesh_follower import PATIENCE, MeshFollower
-from tissue_sim.messages import DeltaEncoder, mesh_message
-from tissue_sim.refusals import Refusals
-from tissue_sim.replica import MeshReplica
-from tissue_sim.ros import stamp
-from tissue_sim.stamps import REVISIONS, nanoseconds, newer
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.rejections import RejectionStatistics
+from cutting_trainer.node_common.ros import stamp
+from cutting_trainer.node_common.stamps import REVISION_MODULUS, nanoseconds, newer
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.streaming.link_budget import LinkBudget
+from cutting_trainer.tissue_sim.streaming.mesh_follower import (
+    STALE_REVISION_TIMEOUT_S,
+    MeshFollower,
+)
+from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, mesh_message
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.long
 
 SECOND = 1_000_000_000
 END_OF_32_BITS = 2**31 * SECOND
@@ -61,8 +64,8 @@ class Graph:
         self.node = Node('graph', context=self.context)
         self.meshes = self.node.create_publisher(Mesh, ros.MESH, ros.LATCHED)
         self.updates = self.node.create_publisher(MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
-        self.refusals = Refusals()
-        self.follower = MeshFollower(self.node, self.refusals)
+        self.rejections = RejectionStatistics()
+        self.follower = MeshFollower(self.node, self.rejections)
         wait_for(lambda: self.updates.get_subscription_count() == 1, 'the follower')
 
     def reaches(self, revision: int) -> bool:
@@ -126,7 +129,7 @@ def test_a_mesh_of_a_simulation_that_was_replaced_is_refused_while_the_new_one_s
 def test_a_simulation_that_began_anew_is_followed_when_the_old_one_is_silent(graph: Graph) -> None:
     settle(graph, Tissue(revision=100))
     anew = Tissue(begun=200 * SECOND)
-    graph.polled(PATIENCE + 0.1)
+    graph.polled(STALE_REVISION_TIMEOUT_S + 0.1)
     graph.meshes.publish(anew.keyframe())
     assert graph.reaches(0)
 
@@ -138,11 +141,11 @@ def test_what_cannot_be_read_hides_nothing_that_comes_behind_it(graph: Graph) ->
         graph.updates.publish(b'\0\1\0\0junk')
     graph.updates.publish(tissue.move())
     assert graph.reaches(4)
-    assert graph.refusals.values() == {'refused tissue/mesh_updates: no such message': 3}
+    assert graph.rejections.values() == {'refused tissue/mesh_updates: no such message': 3}
 
 
 def test_revisions_are_followed_over_their_wrap_around(graph: Graph) -> None:
-    tissue = Tissue(revision=REVISIONS - 3)
+    tissue = Tissue(revision=REVISION_MODULUS - 3)
     settle(graph, tissue, moves=6)
     assert graph.follower.replica.revision == 3
     assert graph.follower.gaps == 0
@@ -164,8 +167,8 @@ def test_stamps_are_right_until_2106(time: int, same: bool) -> None:
 
 
 def test_what_is_newer_is_so_across_the_wrap_around() -> None:
-    assert newer(0, -1) and newer(1, 0) and newer(2, REVISIONS - 1)
-    assert not newer(0, 0) and not newer(0, 1) and not newer(REVISIONS - 1, 2)
+    assert newer(0, -1) and newer(1, 0) and newer(2, REVISION_MODULUS - 1)
+    assert not newer(0, 0) and not newer(0, 1) and not newer(REVISION_MODULUS - 1, 2)
 
 
 @pytest.mark.parametrize('count', ['node_count', 'tetrahedron_count', 'triangle_count'])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from rig import FRAME, PROFILE, RADIUS, K, Rig
 
-from haptic_bridge.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.long
 
 POINTS, WIDTH, DEPTH = 101, 0.1, 4e-3
 BEFORE, CHANGES = 10, 8

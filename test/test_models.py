@@ -9,18 +9,24 @@ from hypothesis import strategies as st
 from meshes import box, irregular_box
 from scipy.spatial.transform import Rotation
 
-from cutting.fuzz import random_stroke, shuffled_box
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from tissue_sim.blade import Sweep
-from tissue_sim.compliance import solve_static
-from tissue_sim.elasticity import MODELS, PLAIN_SHARE, ElasticModel, ModelName
-from tissue_sim.errors import MeshError
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
+from bench.cuts.random_strokes import random_stroke, shuffled_box
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.node_common.errors import MeshError
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import (
+    MODELS,
+    PLAIN_SHARE,
+    ElasticModel,
+    ModelName,
+)
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 LIVER = Material(642.55, 0.47, 1050.0)
 TURNING: tuple[ModelName, ...] = ('corotational', 'corotational_smoothed')
+STIFF = Material(5400.0, 0.45, 1060.0, stiffening=6.0)
 every_model = pytest.mark.parametrize('name', MODELS)
 
 
@@ -144,6 +150,61 @@ def test_rotations_stay_proper_and_settle_wherever_they_come_from(
     rotation = Rotation.random(random_state=seed).as_matrix()
     force, energy = model.evaluate(nodes @ rotation.T - nodes)
     assert np.abs(force).max() < 1e-10 * np.abs(model.force(0.01 * nodes)).max()
+
+
+@pytest.mark.parametrize('tolerance', [0.0, 0.05, 0.2])
+@pytest.mark.parametrize('size', [1e-4, 1e-3, 4e-3])
+def test_forces_of_a_law_are_the_gradient_of_its_energy_blended_or_inside_out(
+    tolerance: float, size: float
+) -> None:
+    nodes, tets = irregular_box((3, 2, 2), 0.01, 4)
+    model = ElasticModel(TetMesh(nodes, tets), STIFF, 'stiffening', tolerance)
+    rng = np.random.default_rng(4)
+    u, d = rng.normal(size=(2, *nodes.shape)) * np.array([[[size]], [[1e-8]]])
+    force = model.force(u)
+    slope = (model.evaluate(u + d)[1] - model.evaluate(u - d)[1]) / 2
+    assert slope == pytest.approx(np.sum(force * d), rel=1e-5)
+    assert np.abs(force.sum(axis=0)).max() < 1e-12 * np.abs(force).max()
+
+
+@pytest.mark.parametrize('degrees', [30.0, 90.0, 180.0])
+def test_a_rigid_rotation_gives_no_force_by_the_law(degrees: float) -> None:
+    nodes, tets = irregular_box((3, 3, 2), 0.01, 2)
+    model = model_of(nodes, tets, 'stiffening', STIFF)
+    reference = np.abs(model.force(0.01 * nodes)).max()
+    axis = np.array([0.48, -0.6, 0.64])
+    rotation = Rotation.from_rotvec(np.deg2rad(degrees) * axis).as_matrix()
+    force, energy = model.evaluate(nodes @ rotation.T - nodes + 0.01)
+    assert np.abs(force).max() < 1e-10 * reference
+    assert abs(energy) < 1e-15
+
+
+@pytest.mark.parametrize('stretch', [0.75, 1.3])
+def test_a_homogeneous_strain_meets_the_law_itself(stretch: float) -> None:
+    """Uniaxial strain, J = s: sigma = mu exp(b x) (s - 1 / s) + lambda ln s / s by rest area."""
+    nodes, tets = irregular_box((3, 3, 3), 0.01, 1)
+    model = model_of(nodes, tets, 'stiffening', STIFF)
+    force = model.force(nodes * np.array([0.0, 0.0, stretch - 1]))
+    pulled = force[nodes[:, 2] > 0.03 - 1e-9, 2].sum() / 9e-4
+    s, log = stretch, np.log(stretch)
+    rise = STIFF.lame_mu * np.exp(6.0 * (s * s - 1 - 2 * log))
+    expected = rise * (s - 1 / s) + STIFF.lame_lambda * log / s
+    assert pulled == pytest.approx(expected, rel=1e-9)
+
+
+def test_an_element_inside_out_is_driven_back() -> None:
+    nodes, tets = box((1, 1, 1), 0.01)
+    model = model_of(nodes, tets, 'stiffening', STIFF)
+    u = np.zeros_like(nodes)
+    top = nodes[:, 2] > 0.005
+    energies, drives = [], []
+    for depth in np.linspace(0.004, 0.03, 20):  # beyond the underside from 0.01 on
+        u[top, 2] = -depth
+        force, energy = model.evaluate(u)
+        energies.append(energy)
+        drives.append(force[top, 2].sum())
+    assert (np.diff(energies) > 0).all()
+    assert max(drives) < 0 and np.isfinite(drives).all()
 
 
 def cantilever(name: ModelName, across: int, nu: float) -> float:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from haptic_bridge.omni import ForceLatch, OmniConvention
-from session.graph import node_environment
+from cutting_trainer.haptic_bridge.devices.omni import ForceLatch, OmniConvention
+from cutting_trainer.session.graph import node_environment
 
 pytestmark = pytest.mark.real_time
 
@@ -43,7 +43,7 @@ def test_a_force_is_held_for_30_ms_and_no_longer():
         assert latch.force(43 * MILLISECOND) == (0, 0, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
     ours = node_environment(DOMAIN)
     environment = others_messages | {
@@ -53,7 +53,14 @@ def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
     remapped = [word for name in names for word in ('-r', f'omni/{name}:=phantom/{name}')]
     parameters = ['-p', 'unit:=mm', '-p', 'force_axes:=x z y']
     adapter = subprocess.Popen(
-        [sys.executable, '-m', 'haptic_bridge.omni_node', '--ros-args', *parameters, *remapped],
+        [
+            sys.executable,
+            '-m',
+            'cutting_trainer.haptic_bridge.devices.omni_node',
+            '--ros-args',
+            *parameters,
+            *remapped,
+        ],
         cwd=ROOT,
         env=environment,
         stdout=subprocess.PIPE,
@@ -83,7 +90,7 @@ def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
 def test_without_omni_msgs_the_adapter_says_what_to_do(tmp_path):
     pytest.importorskip('rclpy')
     done = subprocess.run(
-        [sys.executable, '-m', 'haptic_bridge.omni_node'],
+        [sys.executable, '-m', 'cutting_trainer.haptic_bridge.devices.omni_node'],
         cwd=ROOT,
         env=node_environment(DOMAIN),
         capture_output=True,

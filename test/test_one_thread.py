@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from meshes import box
 
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.blade import Resistance
-from tissue_sim.contact import press_triangle
-from tissue_sim.dynamics import TimeStepping
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
-from tissue_sim.simulation import TissueSimulation
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.contact.tool import indenter_contact
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 pytestmark = pytest.mark.alone
 
@@ -41,7 +41,7 @@ def test_frames_of_a_large_tissue_take_no_second_core(nodes: int) -> None:
         if step == 10:
             own, all_threads = time.thread_time(), time.process_time()
         along = np.array([1e-3 * step, 0.0, 0.0])
-        assert not simulation.frame(press_triangle(mesh, middle + along, down, 2e-3)).trouble
+        assert not simulation.frame(indenter_contact(mesh, middle + along, down, 2e-3)).trouble
     own, all_threads = time.thread_time() - own, time.process_time() - all_threads
     assert own > 0.05
     assert all_threads < 1.2 * own

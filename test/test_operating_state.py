@@ -1,26 +1,33 @@
 """Claims about CRTK's state machine."""
 
+import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import rclpy
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.parameter import Parameter
 
-from haptic_bridge.node import HapticBridge
-from haptic_bridge.operating_state import (
+from cutting_trainer.haptic_bridge.node import HapticBridge
+from cutting_trainer.node_common.crtk import REPLY_PERIOD_S
+from cutting_trainer.node_common.lifecycle import Stop
+from cutting_trainer.node_common.operating_state import (
     COMMANDS,
     E_STOP,
+    CrtkState,
     OperatingStateMachine,
-    State,
     crtk_types,
     device_cause,
 )
-from session.domain import reserved_domain
-from tissue_sim.lifecycle import Stop
+from cutting_trainer.node_common.rejections import MessageError
+from cutting_trainer.session.domain import reserved_domain
 
-D, E, P, F = State.DISABLED, State.ENABLED, State.PAUSED, State.FAULT
+D, E, P, F = CrtkState.DISABLED, CrtkState.ENABLED, CrtkState.PAUSED, CrtkState.FAULT
 INVALID = True
 # CRTK's table: state by state, the command, the state after it, and whether it is invalid there.
 TABLE = [
@@ -43,7 +50,7 @@ TABLE = [
 ]
 
 
-def machine_in(state: State) -> OperatingStateMachine:
+def machine_in(state: CrtkState) -> OperatingStateMachine:
     machine = OperatingStateMachine()
     for command in {D: (), E: ('enable',), P: ('enable', 'pause'), F: ()}[state]:
         machine.command(command)
@@ -66,17 +73,25 @@ def test_enable_while_paused_points_to_resume():
     assert 'use resume' in machine_in(P).command('enable')
 
 
-@pytest.mark.parametrize('before', State)
-def test_emergency_stop_is_a_fault_from_every_state_until_a_command_leaves_it(before):
+@pytest.mark.parametrize('before', CrtkState)
+@pytest.mark.parametrize('command', [*COMMANDS, E_STOP, 'no such'])
+def test_e_stop_holds_in_every_state_against_every_command_until_it_is_reset(before, command):
     machine = machine_in(before)
     assert machine.command(E_STOP) == ''
-    assert machine.state is F
-    assert machine.reason == ('the cable is off' if before is F else 'emergency stop')
-    for refused in ('resume', 'pause'):
-        assert machine.command(refused)
-        assert machine.state is F
-    assert machine.command('disable') == ''
-    assert machine.state is D
+    refused = machine.command(command)
+    assert 'reset_e_stop' in refused or command in (E_STOP, 'no such')
+    machine.fault('the cable is off')
+    assert (machine.state, machine.reason, machine.e_stopped) == (F, 'emergency stop', True)
+    assert machine.reset()
+    assert (machine.state, machine.reason, machine.e_stopped) == (D, '', False)
+    assert not machine.reset()
+
+
+def test_e_stop_of_a_device_that_nobody_resets_is_a_fault_like_any_other():
+    machine = OperatingStateMachine(latches=False)
+    machine.command(E_STOP)
+    assert (machine.state, machine.reason) == (F, 'emergency stop')
+    assert machine.command('enable') == ''
 
 
 @given(st.lists(st.sampled_from(COMMANDS)))
@@ -87,7 +102,7 @@ def test_no_sequence_of_commands_enters_fault(commands):
         assert machine.state is not F
 
 
-@pytest.mark.parametrize('state', State)
+@pytest.mark.parametrize('state', CrtkState)
 def test_fault_is_entered_from_every_state_and_latched_with_its_reason(state):
     machine = machine_in(state)
     machine.fault('the cable is off')
@@ -113,6 +128,31 @@ def test_enable_is_refused_with_a_reason_while_the_cause_lasts(state):
     assert (machine.state, machine.reason) == (E, '')
 
 
+@pytest.mark.parametrize(
+    ('state', 'name', 'refused'),
+    [
+        (CrtkState.DISABLED, 'enable', 'enable refused: the cable is off'),
+        (CrtkState.FAULT, 'enable', 'enable refused: the cable is off'),
+        (CrtkState.PAUSED, 'resume', 'resume is not valid in state FAULT'),
+    ],
+)
+def test_a_loop_reports_a_fault_while_the_cause_is_asked_for_and_it_counts(state, name, refused):
+    reported: list[bool] = []
+
+    def cause() -> str:
+        loop = threading.Thread(target=machine.fault, args=('the cable is off',), daemon=True)
+        loop.start()
+        loop.join(2.0)
+        reported.append(not loop.is_alive())
+        return ''
+
+    machine = machine_in(state)
+    machine._cause = cause
+    assert machine.command(name) == refused
+    assert reported == [True]
+    assert machine.state is CrtkState.FAULT
+
+
 def test_home_and_unhome_change_the_flag_and_no_state():
     machine = machine_in(P)
     machine.command('unhome')
@@ -125,6 +165,50 @@ def test_unknown_command_is_refused_with_the_known_ones():
     refused = OperatingStateMachine().command('Enable')
     assert "'Enable'" in refused
     assert all(command in refused for command in COMMANDS)
+
+
+def stop_and_reset(machine: OperatingStateMachine) -> None:
+    machine.press()
+    machine.reset()
+
+
+MEANWHILE = {
+    'disable': lambda machine: machine.command('disable'),
+    'disable twice': lambda machine: [machine.command('disable') for _ in range(2)],
+    'E-STOP and reset': stop_and_reset,
+    'a new configuration': OperatingStateMachine.start_anew,
+}
+
+
+@pytest.mark.parametrize('meanwhile', MEANWHILE)
+def test_enable_that_still_looks_at_the_graph_overrides_no_later_command(meanwhile):
+    machine = OperatingStateMachine(lambda: MEANWHILE[meanwhile](machine) or '')
+    assert 'another command came meanwhile' in machine.command('enable')
+    assert machine.state is D
+
+
+def test_resume_that_still_looks_at_the_graph_leaves_a_later_pause():
+    machine = OperatingStateMachine()
+    machine.command('enable')
+    machine.command('pause')
+    machine._cause = lambda: machine.command('pause')
+    assert 'another command came meanwhile' in machine.command('resume')
+    assert machine.state is P
+
+
+def test_enable_asked_while_e_stop_is_pressed_is_refused_though_a_reset_comes_at_once():
+    asked = []
+    machine = OperatingStateMachine(lambda: asked.append(1) or '', pressed=True)
+    enables = machine._enables
+
+    def enables_then_reset(name: str) -> bool:
+        found = enables(name)
+        machine.reset()
+        return found
+
+    machine._enables = enables_then_reset
+    assert machine.command('enable')
+    assert machine.state is D and not asked
 
 
 def test_changes_count_only_what_an_observer_would_see():
@@ -175,12 +259,45 @@ def test_a_bridge_that_was_stopped_before_its_start_does_not_enable_itself(
 ):
     monkeypatch.setattr(bridge._path, 'is_fresh', lambda now_ns: True)
     monkeypatch.setattr(bridge._machine, '_cause', str)
+    bridge._machine.fault('no device')
     bridge._machine.command(E_STOP)
     bridge._watch_state()
     assert (bridge._machine.state, bridge._machine.reason) == (F, 'emergency stop')
-    bridge._machine.command('disable')  # a person's
+    assert bridge._machine.reset()
     bridge._watch_state()
-    assert bridge._machine.state is E
+    assert bridge._machine.state is D  # and stays so until a person enables it
+
+
+def test_every_command_is_answered_by_the_state_and_a_flood_of_them_is_answered_seldom(
+    bridge: HapticBridge, monkeypatch: pytest.MonkeyPatch
+):
+    interface, heard = bridge._interface, []
+    monkeypatch.setattr(interface, '_publisher', SimpleNamespace(publish=heard.append))
+    word = crtk_types().command
+
+    def send(name: str) -> None:
+        with suppress(MessageError):
+            interface._command(word(string=name))
+
+    for name in ('disable', 'home', 'resume', 'nonsense'):
+        time.sleep(2 * REPLY_PERIOD_S)
+        before = len(heard)
+        send(name)
+        assert [m.state for m in heard[before:]] == ['DISABLED'], name
+    time.sleep(2 * REPLY_PERIOD_S)
+    before, began = len(heard), time.monotonic()
+    for _ in range(1000):
+        send('nonsense')
+    assert len(heard) - before <= 2 + (time.monotonic() - began) / REPLY_PERIOD_S
+    time.sleep(2 * REPLY_PERIOD_S)
+    before = len(heard)
+    interface.publish_changes()  # as the loop does: the last of them waits for no further command
+    interface.publish_changes()
+    assert len(heard) == before + 1
+    for _ in range(2):  # and once more, for a client that was still sending
+        time.sleep(2 * REPLY_PERIOD_S)
+        interface.publish_changes()
+    assert len(heard) == before + 2
 
 
 def test_a_bridge_whose_state_watch_fails_is_in_fault_and_follows_the_mesh(
@@ -192,3 +309,11 @@ def test_a_bridge_whose_state_watch_fails_is_in_fault_and_follows_the_mesh(
     bridge._work_beside(Stop(lambda: len(followed) > 5))
     assert bridge._machine.state is F
     assert 'the state watch failed: ZeroDivisionError' in bridge._machine.reason
+
+
+def test_of_a_request_that_is_refused_nothing_is_used(bridge: HapticBridge):
+    request = [Parameter('force_scale', value=value) for value in (1.5, float('nan'))]
+    assert not bridge.set_parameters_atomically(request).successful
+    assert bridge._path.haptics.force_scale == 1.0
+    assert bridge.set_parameters_atomically(request[:1]).successful
+    assert bridge._path.haptics.force_scale == 1.5

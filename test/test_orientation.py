@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from haptic_bridge.orientation import from_quaternion, from_rpy, quaternion
+from cutting_trainer.node_common.orientation import from_quaternion, from_rpy, quaternion
 
 ANGLE = st.floats(-720, 720) | st.sampled_from([0.0, 90.0, 180.0, -180.0])
 PART = st.floats(-1, 1)

@@ -13,11 +13,15 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from session.graph import MODULES, PROFILES, RANGE
-from tissue_sim.share import is_checkout, share_folder
+from cutting_trainer.node_common.share import is_checkout, share_folder
+from cutting_trainer.session.graph import MODULES, PROFILES, RANGE
+
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ('tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'viewer', 'session')
+ROOMS = tuple(
+    sorted(path.name for path in (ROOT / 'cutting_trainer').iterdir() if path.is_symlink())
+)
 PUBLISHED_AS = {
     '_pytest': 'pytest',
     'mpl_toolkits': 'matplotlib',
@@ -53,19 +57,33 @@ NOT_FROM_PYPI = {
 
 
 def pins(name: str) -> dict[str, str]:
-    lines = (ROOT / name).read_text().splitlines()
-    entries = [re.sub(r'\[.*?]', '', line).lower() for line in lines if line[:1] not in ('', '#')]
+    lines = [line for line in (ROOT / name).read_text().splitlines() if line[:1] not in ('', '#')]
+    entries = [line.split()[0].lower() for line in lines if not line.startswith(' ')]
     assert all(entry.count('==') == 1 for entry in entries), entries
-    return dict(entry.split('==') for entry in entries)
+    pinned = (re.sub(r'\[.*?]', '', entry).split('==') for entry in entries)
+    return {package.replace('ruamel-yaml', 'ruamel.yaml'): version for package, version in pinned}
 
 
-COMPILED = shutil.ignore_patterns('__pycache__', 'sessions')
+MADE = (
+    *('.trainer', '.git', '.mypy_cache', '.ruff_cache', '.pytest_cache', '.hypothesis'),
+    *('__pycache__', 'sessions', 'build', 'install', 'node_modules'),
+)
 LISTS = (
     'requirements.txt',
     'requirements-ros.txt',
     'requirements-mesh.txt',
     'requirements-test.txt',
 )
+
+
+def test_every_file_of_the_page_is_installed_with_its_package(tmp_path: Path) -> None:
+    command = [sys.executable, 'setup.py', '-q', 'build_py', '-d', str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    there, here = (
+        {path.relative_to(folder) for path in (folder / 'viewer' / 'static').rglob('*')}
+        for folder in (tmp_path / 'cutting_trainer', ROOT)
+    )
+    assert there == here
 
 
 @pytest.mark.parametrize('name', LISTS)
@@ -89,19 +107,29 @@ def imported_by(folder: str) -> set[str]:
                 imported |= {alias.name.split('.')[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 imported.add(node.module.split('.')[0])
-    others = imported - sys.stdlib_module_names - {*PACKAGES, 'bench', *ours} - NOT_FROM_PYPI
+    others = (
+        imported - sys.stdlib_module_names - {'cutting_trainer', 'bench', *ours} - NOT_FROM_PYPI
+    )
     return {PUBLISHED_AS.get(name, name) for name in others}
 
 
-@pytest.mark.parametrize('package', PACKAGES)
-def test_every_library_that_a_package_imports_is_pinned_for_run_time(package: str) -> None:
+@pytest.mark.parametrize('room', ROOMS)
+def test_every_library_that_a_room_imports_is_pinned_for_run_time(room: str) -> None:
     # the mesher is an extra: it has no wheels for every machine
-    extra = {'pytetwild'} if package == 'session' else set()
-    assert imported_by(package) <= pins('requirements.txt').keys() | extra
+    extra = {'pytetwild'} if room == 'mesh_import' else set()
+    assert imported_by(room) <= pins('requirements.txt').keys() | extra
 
 
-def test_every_library_that_the_tests_import_is_pinned() -> None:
-    assert imported_by('test') <= {*pins('requirements.txt'), *pins('requirements-test.txt')}
+def test_no_library_is_installed_with_the_product_that_only_the_checkout_needs() -> None:
+    indirect = {'lz4', 'zstandard'}
+    assert pins('requirements.txt').keys() - indirect <= set().union(*map(imported_by, ROOMS))
+
+
+@pytest.mark.parametrize('folder', ['test', 'bench'])
+def test_every_library_that_tests_and_measurements_import_is_pinned(folder: str) -> None:
+    peers = {'mujoco', 'newton', 'warp'} if folder == 'bench' else set()  # optional, their own list
+    known = {*pins('requirements.txt'), *pins('requirements-test.txt'), *peers}
+    assert imported_by(folder) <= known
 
 
 def test_all_manifests_say_the_same_version() -> None:
@@ -121,7 +149,7 @@ def test_every_ros_package_that_is_imported_is_declared() -> None:
         for element in ElementTree.parse(ROOT / 'package.xml').getroot()
         if element.tag.endswith('depend')
     }
-    text = ''.join(path.read_text() for name in PACKAGES for path in (ROOT / name).rglob('*.py'))
+    text = ''.join(path.read_text() for name in ROOMS for path in (ROOT / name).rglob('*.py'))
     # crtk_msgs and omni_msgs are used where they are installed;
     # cutting_trainer_msgs is part of this package
     optional = {'crtk_msgs', 'cutting_trainer_msgs', 'omni_msgs'}
@@ -141,15 +169,15 @@ for name in sys.argv[2:]:
     importlib.import_module(name)
 """
 CORE = (
-    'tissue_sim.assembly',
-    'tissue_sim.replica',
-    'cutting.methods',
-    'haptic_bridge.force_path',
-    'haptic_bridge.arm',
-    'bags.comparison',
-    'session.in_process',
-    'session.recordings.resimulate',
-    'session.trials.chaos_verdict',
+    'cutting_trainer.tissue_sim.assembly',
+    'cutting_trainer.tissue_sim.mesh.replica',
+    'cutting_trainer.cutting.methods',
+    'cutting_trainer.haptic_bridge.force_path',
+    'cutting_trainer.haptic_bridge.emulated_arm.arm',
+    'cutting_trainer.bags.comparison',
+    'cutting_trainer.session.in_process',
+    'cutting_trainer.recordings.resimulate',
+    'bench.trials.chaos_verdict',
 )
 
 
@@ -190,14 +218,26 @@ def test_packages_without_data_anywhere_look_beside_themselves(tmp_path: Path) -
     assert share_folder(tmp_path / 'lib') == tmp_path / 'lib'
 
 
-def test_installed_trainer_finds_scenes_devices_and_profiles(tmp_path: Path) -> None:
-    site = tmp_path / 'lib' / 'python3.12' / 'site-packages'
-    for package in PACKAGES:
-        shutil.copytree(ROOT / package, site / package, ignore=COMPILED)
+@pytest.fixture(scope='module')
+def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the checkout, its links kept, where what building leaves disturbs nobody."""
+    folder = tmp_path_factory.mktemp('workspace') / 'src' / 'cutting_trainer'
+    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*MADE), symlinks=True)
+    return folder
+
+
+def test_installed_trainer_finds_scenes_devices_and_profiles(clone: Path, tmp_path: Path) -> None:
+    pip = [sys.executable, '-m', 'pip', 'install', '--no-deps', '--no-build-isolation']
+    pip += ['--ignore-installed', '--prefix', str(tmp_path), str(clone)]
+    done = subprocess.run(pip, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (site,) = tmp_path.glob('**/site-packages')
+    assert {path.name for path in site.iterdir() if path.suffix != '.dist-info'} == {
+        'cutting_trainer'
+    }
     share = tmp_path / 'share' / 'cutting_trainer'
-    shutil.copytree(ROOT / 'config', share / 'config')
     code = (
-        'from session import demo, graph, scene\n'
+        'from cutting_trainer.session import demo, graph, scene\n'
         'from pathlib import Path\n'
         'print(scene.load_scene("liver").path)\n'
         'print(graph.node_environment(0)["FASTRTPS_DEFAULT_PROFILES_FILE"])\n'
@@ -224,14 +264,16 @@ def test_installed_trainer_finds_scenes_devices_and_profiles(tmp_path: Path) -> 
 # A workspace as anybody's.
 
 
-@pytest.mark.slow
-def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(tmp_path: Path) -> None:
+@pytest.mark.thorough
+@pytest.mark.parametrize('options', [(), ('--symlink-install',)], ids=['copies', 'links'])
+def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(
+    options: tuple[str, ...], tmp_path: Path
+) -> None:
     colcon = shutil.which('colcon')
     if colcon is None:
         pytest.skip('colcon is not installed: with a sourced Jazzy, apt install ros-dev-tools')
     clone = tmp_path / 'src' / 'cutting_trainer'
-    made = ('.trainer', '.git', '__pycache__', '.mypy_cache', 'sessions', 'build', 'install')
-    shutil.copytree(ROOT, clone, ignore=shutil.ignore_patterns(*made))
+    shutil.copytree(ROOT, clone, ignore=shutil.ignore_patterns(*MADE), symlinks=True)
     ours = str(ROOT)
     environ = {key: value for key, value in os.environ.items() if not key.startswith('PYTHON')}
     prefixes = environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
@@ -250,12 +292,13 @@ def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(tmp_pa
         'src/cutting_trainer',
         '(ros.ament_cmake)',
     ]
-    run(colcon, 'build')
+    run(colcon, 'build', *options)
     script = (
-        'import bags, cutting, haptic_bridge, session, tissue_sim, viewer\n'
+        f'from cutting_trainer import {", ".join(ROOMS)}\n'
+        'from cutting_trainer.session import scene\n'
         'from cutting_trainer_msgs.msg import Mesh\n'
         'from cutting_trainer_msgs.srv import Cut\n'
-        'print(tissue_sim.__file__, Mesh.CUT, Cut.Request.ADVANCE)\n'
+        'print(tissue_sim.__file__, scene.SCENES, Mesh.CUT, Cut.Request.ADVANCE)\n'
     )
     sourced = f'. install/setup.sh && exec {sys.executable} -'
     shell = subprocess.run(
@@ -268,11 +311,13 @@ def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(tmp_pa
         check=False,
     )
     assert shell.returncode == 0, shell.stderr
-    where, *constants = shell.stdout.split()
+    where, scenes, *constants = shell.stdout.split()
     assert where.startswith(str(tmp_path / 'install'))
     assert not where.startswith(ours)
     assert constants == ['1', '0']
+    assert (Path(where).parents[1] / 'viewer' / 'static' / 'index.html').is_file()
     share = tmp_path / 'install' / 'cutting_trainer' / 'share'
+    assert scenes == str(share / 'cutting_trainer' / 'config' / 'scenes')
     for package in ('cutting_trainer', 'cutting_trainer_msgs'):
         assert (share / 'ament_index' / 'resource_index' / 'packages' / package).is_file()
     assert (share / 'cutting_trainer' / 'launch' / 'trainer.launch.py').is_file()

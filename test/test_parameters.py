@@ -10,8 +10,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from tissue_sim.parameters import parameter, seed_parameter
-from tissue_sim.share import PACKAGES
+from cutting_trainer.node_common.parameters import parameter, seed_parameter
+from cutting_trainer.node_common.share import PACKAGES
 
 
 def made(**values: object) -> Iterator[Node]:
@@ -50,4 +50,6 @@ def test_no_node_has_a_parameter_without_a_description() -> None:
                 if isinstance(call, ast.Call) and getattr(call.func, 'attr', '') == (
                     'declare_parameter'
                 ):
-                    assert path.name == 'parameters.py', f'{path}: use tissue_sim.parameters'
+                    assert path.name == 'parameters.py', (
+                        f'{path}: use cutting_trainer.node_common.parameters'
+                    )

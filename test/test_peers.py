@@ -1,4 +1,4 @@
-"""Claims about `bench.peers`, none of which needs a peer."""
+"""Claims about `bench.accuracy.peers`, none of which needs a peer."""
 
 import json
 from xml.etree import ElementTree
@@ -6,12 +6,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from bench import peers
-from bench.peer_beam import make_beam, measure, stable_step
-from bench.peer_solvers import flexcomp, neo_hookean
-from session.measure.chart_problems import material
-from tissue_sim.elasticity import ElasticModel, ModelName
-from tissue_sim.equilibrium import equilibrium
+from bench.accuracy import peers
+from bench.accuracy.peer_beam import make_beam, measure, stable_step
+from bench.accuracy.peer_solvers import flexcomp, neo_hookean
+from bench.accuracy.problems import material
+from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 
 
 @pytest.mark.parametrize('name', ['linear', 'corotational_smoothed'])
@@ -70,7 +70,7 @@ def test_absent_peers_are_said_to_be_absent_and_the_others_are_measured(
     rows = json.loads(capfd.readouterr().out)['rows']
     ours = [row for row in rows if row['package'] == 'the trainer']
     others = [row for row in rows if row not in ours]
-    assert len(ours) == 4 and all(row['result']['tetrahedra'] == 30 for row in ours)
+    assert len(ours) == 5 and all(row['result']['tetrahedra'] == 30 for row in ours)
     assert len(others) == 2
     assert all(r['result'] is None and 'not installed' in r['note'] for r in others)
 

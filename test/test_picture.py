@@ -7,13 +7,15 @@ import pytest
 from cutting_trainer_msgs.msg import Mesh, MeshDelta
 from rclpy.serialization import serialize_message
 
-from bags.message_text import schema_text
-from bags.qos import OfferedQos
-from bags.writer import BagWriter
-from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
-from session.errors import SessionError
-from session.recordings import picture
-from session.recordings.picture import make_picture, read_story
+from cutting_trainer.bags.message_text import schema_text
+from cutting_trainer.bags.qos import OfferedQos
+from cutting_trainer.bags.writer import BagWriter
+from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
+from cutting_trainer.recordings import picture
+from cutting_trainer.recordings.picture import make_picture, read_story
+from cutting_trainer.session.errors import SessionError
+
+pytestmark = pytest.mark.long
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

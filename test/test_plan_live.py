@@ -18,20 +18,21 @@ from rclpy.executors import SingleThreadedExecutor
 from ruamel.yaml import YAML
 from std_msgs.msg import Header
 
-from bags.comparison import compare
-from bags.reader import open_bag
-from session.domain import reserved_domain
-from session.graph import node_environment
-from session.recordings.html_report import write_report
-from session.recordings.recorded_scene import restore_scene
-from session.recordings.resimulate import pose_check, recomputation
-from session.scene import load_scene
-from session.status import Status
-from tissue_sim import ros
-from tissue_sim.assembly import make_task
-from tissue_sim.contact import State, ToolContact, press_triangle
-from tissue_sim.mesh import TopologyDelta
-from tissue_sim.messages import delta_into
+from cutting_trainer.bags.comparison import compare
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.node_common import ros
+from cutting_trainer.recordings.html_report import write_report
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate import pose_check, recomputation
+from cutting_trainer.session.domain import reserved_domain
+from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.tissue_sim.assembly import make_task
+from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact, indenter_contact
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
+from cutting_trainer.tissue_sim.streaming.messages import delta_into
+
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[1]
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -82,7 +83,7 @@ class Surroundings:
             return
         self._sent += 1
         depth = min(0.0004 * self._sent, 0.008)
-        contact = press_triangle(self.mesh, np.array([0.0, 0.0, 0.01]), DOWN, depth)
+        contact = indenter_contact(self.mesh, np.array([0.0, 0.0, 0.01]), DOWN, depth)
         along = np.array([max(0.0005 * (self._sent - 40), 0.0), 0.0, 0.0])
         self._contacts.publish(self._message(contact, along))
 
@@ -93,7 +94,7 @@ class Surroundings:
         return Contact(
             header=Header(frame_id=ros.FRAME),
             sequence=self._sent,
-            state=int(State.TOUCHING),
+            state=int(ContactState.TOUCHING),
             topology=0,
             nodes=np.resize(contact.nodes, 9).astype(np.uint32),
             weights=weights,
@@ -153,7 +154,14 @@ def run(tmp_path: Path, domain: int) -> Iterator[Any]:
         said = tmp_path / 'said'
         with said.open('wb') as file:
             process = subprocess.Popen(
-                [sys.executable, '-m', 'tissue_sim.node', '--ros-args', '-p', f'scene:={scene}'],
+                [
+                    sys.executable,
+                    '-m',
+                    'cutting_trainer.tissue_sim.node',
+                    '--ros-args',
+                    '-p',
+                    f'scene:={scene}',
+                ],
                 cwd=ROOT,
                 env=node_environment(domain),
                 stdout=file,
@@ -210,6 +218,7 @@ def test_a_node_for_whose_budget_nothing_fits_runs_as_the_scene_says_and_says_so
     assert 'a mesh with edges' in surroundings.status.message
 
 
+@pytest.mark.thorough
 @pytest.mark.real_time
 def test_a_session_that_plans_is_computed_again_and_reported_by_what_it_took(
     tmp_path: Path,
@@ -221,7 +230,7 @@ def test_a_session_that_plans_is_computed_again_and_reported_by_what_it_took(
         YAML().dump(scene, file)
     session = LiveSession(tmp_path, path, free_domain())
     try:
-        assert session.end() == Status.OK, session.said
+        assert not session.complaints(), session.said
     finally:
         session.clean()
     bag = open_bag(session.bag)

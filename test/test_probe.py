@@ -6,20 +6,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from haptic_bridge.probe import (
-    ASKED_MOVE,
-    PUSH,
+from cutting_trainer.haptic_bridge.devices.probe import (
+    PUSH_FORCE_N,
+    REQUESTED_MOVE_M,
     Poses,
     check_moves,
-    check_push,
     check_stream,
     find_move,
 )
-from haptic_bridge.settings import DeviceProfile
+from cutting_trainer.haptic_bridge.devices.probe_force import check_push
+from cutting_trainer.haptic_bridge.settings import DeviceProfile
 
 PROFILE = DeviceProfile(max_force=1, max_slew=100, max_stiffness=100, workspace=(0.2, 0.2, 0.2))
 START = 1.7e9
-FORCES = PUSH * np.vstack([np.eye(3), -np.eye(3)])
+FORCES = PUSH_FORCE_N * np.vstack([np.eye(3), -np.eye(3)])
 
 
 def stream(rate: float = 1000.0, age: float = 5e-4, **changes: object) -> Poses:
@@ -70,7 +70,7 @@ def test_unit_and_handedness_are_found_however_the_device_stands(seed, unit, mir
     random = np.random.default_rng(seed)
     turn = Rotation.random(random_state=seed).as_matrix()
     hand = np.diag([1.0, 1.0, -1.0 if mirrored else 1.0])
-    lengths = ASKED_MOVE * random.uniform(0.5, 1.8, 3)
+    lengths = REQUESTED_MOVE_M * random.uniform(0.5, 1.8, 3)
     slanted = np.eye(3) + random.uniform(-0.15, 0.15, (3, 3))
     moves = [unit * hand @ turn @ (lengths[k] * slanted[k]) for k in range(3)]
     by_name = {check.name: check for check in check_moves(moves, 'cp')}

@@ -10,19 +10,19 @@ import rclpy
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from haptic_bridge import probe_node
-from session import cli
-from session import probe as command
-from session.probe import Emulation, ProbeOptions, run_probe
-from session.status import Status
-from tissue_sim.ros import STREAM, polled, take
+from cutting_trainer.cli import main as cli
+from cutting_trainer.haptic_bridge.devices import probe_node
+from cutting_trainer.node_common.ros import STREAM, polled, take
+from cutting_trainer.session import probe as command
+from cutting_trainer.session.probe import Emulation, ProbeOptions, run_probe
+from cutting_trainer.session.status import Status
 
 pytestmark = pytest.mark.real_time
 
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(command, 'STILL', 1.0)
+    monkeypatch.setattr(command, 'REST_TIME_S', 1.0)
     with mock.patch.dict(os.environ):
         yield
 
@@ -32,7 +32,7 @@ def found(capsys: pytest.CaptureFixture[str], **options: object) -> tuple[Status
     return status, {check['name']: check for check in json.loads(capsys.readouterr().out)}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_good_arm_passes_every_check(capsys):
     for _ in range(3):  # again where the machine was held up
         status, checks = found(capsys, emulation=Emulation(), push=True)
@@ -41,9 +41,20 @@ def test_a_good_arm_passes_every_check(capsys):
             break
     assert (status, wrong) == (Status.OK, set())
     assert {'publisher', 'rate', 'jitter', 'age', 'unit', 'handedness', 'force'} < set(checks)
+    assert {'scale', 'orientation', 'gain', 'release', 'frame'} < set(checks)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
+def test_a_driver_that_gets_everything_wrong_is_told_so(capsys):
+    faults = 'turn=40 gain=2 scale=2 w_first=1 frame_after=4 held=1'
+    status, checks = found(capsys, emulation=Emulation(faults=faults), push=True)
+    assert status == Status.FAILED
+    for name in ('force', 'gain', 'scale', 'orientation', 'frame', 'release'):
+        assert checks[name]['verdict'] == 'wrong', checks[name]
+    assert 'w x y z' in checks['orientation']['sentence']
+
+
+@pytest.mark.thorough
 def test_an_arm_that_is_wrong_in_every_way_is_told_so_in_every_way(capsys):
     wrong = Emulation(
         arm={'rate': 200.0},
@@ -65,7 +76,7 @@ def test_an_arm_that_is_wrong_in_every_way_is_told_so_in_every_way(capsys):
 @pytest.fixture
 def neighbour(monkeypatch: pytest.MonkeyPatch) -> Iterator[rclpy.node.Node]:
     """A node in the domain that the probe will take."""
-    monkeypatch.setattr(probe_node, 'PATIENCE', 2.0)
+    monkeypatch.setattr(probe_node, 'FIRST_POSE_TIMEOUT_S', 2.0)
     with command.reserved_domain('free') as domain:
         pass
     os.environ.update(command.node_environment(domain))

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from surfaces import distance, grid, joined, slab
 
-from haptic_bridge.proxy import Proxy
-from haptic_bridge.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
 
 R = 0.004
 UP = np.array([0, 0, 1])

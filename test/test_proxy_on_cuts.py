@@ -11,10 +11,10 @@ from meshes import irregular_box
 from strokes import method_named, straight
 from surfaces import distance, joined, slab
 
-from haptic_bridge.proxy import Proxy
-from haptic_bridge.surface import Surface
-from tissue_sim.blade import Sweep
-from tissue_sim.mesh import TetMesh
+from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 H = 0.005
 CELLS = (8, 4, 3)

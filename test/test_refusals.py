@@ -1,4 +1,4 @@
-"""What cannot be used is refused at the edge with a reason, and refusals stay bounded."""
+"""What cannot be used is refused at the edge with a reason, and the statistics stay bounded."""
 
 import math
 import re
@@ -9,28 +9,30 @@ import numpy as np
 import pytest
 from meshes import irregular_box
 
-from haptic_bridge.operating_state import OperatingStateMachine
-from haptic_bridge.wire import (
-    LONGEST_FRAME,
+from cutting_trainer.node_common.cdr_codec import (
+    MAX_FRAME_ID_LENGTH,
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
     StampedCodec,
     WrenchStampedCodec,
 )
-from tissue_sim.errors import MeshError
-from tissue_sim.mesh import TetMesh
-from tissue_sim.refusals import (
-    LONGEST_DETAIL,
-    LONGEST_SAID,
-    MOST_REASONS,
-    OTHERS,
+from cutting_trainer.node_common.errors import MeshError
+from cutting_trainer.node_common.operating_state import OperatingStateMachine
+from cutting_trainer.node_common.rejections import (
+    MAX_DETAIL_LENGTH,
+    MAX_REASON_LENGTH,
+    MAX_REASONS,
+    OTHER_REASONS,
     MessageError,
-    Refusals,
+    RejectionStatistics,
     require_frame,
 )
-from tissue_sim.replica import MeshReplica, state_hash
-from tissue_sim.tool_contact import tool_contact
+from cutting_trainer.tissue_sim.contact.incoming import tool_contact
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica, state_hash
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+
+pytestmark = pytest.mark.long
 
 NODES = 20
 TISSUE = SimpleNamespace(node_count=NODES, topology=0)
@@ -50,8 +52,9 @@ def contact(**changed: Any) -> SimpleNamespace:
         'normal': np.array([0.0, 0.0, 1.0]),
         'coupling_stiffness': 200.0,
         'proxy_radius': 0.004,
+        'tool': 0,
     }
-    for name in ('device', 'proxy', 'point', 'blade_root', 'blade_tip'):
+    for name in ('device', 'proxy', 'point', 'blade_root', 'blade_tip', 'external_force'):
         fields[name] = np.zeros(3)
     return SimpleNamespace(**fields | changed)
 
@@ -105,15 +108,18 @@ def test_a_contact_of_before_a_cut_that_took_nodes_away_is_none_of_its_nodes() -
     ('changed', 'reason'),
     [
         ({'state': 3}, 'no such state'),
+        ({'tool': 1}, 'no such tool'),
         ({'nodes': np.full(9, 2**32 - 1, np.uint32)}, 'index out of range'),
-        ({'weights': np.full(9, 0.5)}, 'weights that are none'),
-        ({'normal': np.array([0.0, 0.0, 1.1])}, 'normal that is none'),
+        ({'weights': np.full(9, 0.5)}, 'invalid weights'),
+        ({'normal': np.array([0.0, 0.0, 1.1])}, 'invalid normal'),
         ({'coupling_stiffness': math.nan}, 'stiffness out of range'),
         ({'coupling_stiffness': -1.0}, 'stiffness out of range'),
         ({'coupling_stiffness': 0.0}, 'stiffness out of range'),
         ({'coupling_stiffness': 5e-324, 'state': 0}, 'stiffness out of range'),
         ({'coupling_stiffness': 2e5}, 'stiffness out of range'),
         ({'proxy_radius': math.inf}, 'radius out of range'),
+        ({'proxy_radius': 9e-6}, 'radius out of range'),
+        ({'external_force': np.array([math.nan, 0.0, 0.0])}, 'force out of range'),
         (
             {'header': SimpleNamespace(frame_id='arm', stamp=contact().header.stamp)},
             'wrong frame',
@@ -144,8 +150,8 @@ def test_each_other_field_of_a_contact_is_refused_with_its_reason(changed, reaso
         ({'tetrahedra': mesh().tetrahedra[:-1]}, 'arrays that do not fit'),
         ({'fixed': mesh().fixed[:-1]}, 'arrays that do not fit'),
         ({'rest': np.zeros(0)}, 'index out of range'),
-        ({'rest': mesh().rest + 1e-6}, 'not what its hash says'),
-        ({'tetrahedra': np.roll(mesh().tetrahedra, 4)}, 'not what its hash says'),
+        ({'rest': mesh().rest + 1e-6}, 'wrong hash'),
+        ({'tetrahedra': np.roll(mesh().tetrahedra, 4)}, 'wrong hash'),
     ],
 )
 def test_a_mesh_that_cannot_be_is_refused_and_the_one_before_stays(changed, reason: str) -> None:
@@ -207,6 +213,10 @@ def test_an_orientation_or_a_state_that_does_not_exist_is_not_believed() -> None
         values[codec.fields['state'].start] = 3
         with pytest.raises(MessageError, match='no such state'):
             codec().believed(codec().encode(5, values))
+        values = [0] * len(values)
+        values[codec.fields['tool'].start] = 1
+        with pytest.raises(MessageError, match=r'tool 1 of .*: the scene has 1, and the first is'):
+            codec().believed(codec().encode(5, values))
 
 
 def test_a_surface_that_is_not_that_of_its_tetrahedra_makes_no_mesh() -> None:
@@ -222,44 +232,44 @@ def test_frames_without_end_are_refused_and_new_ones_take_no_memory() -> None:
     for number in range(1000):
         assert reader.decode(PoseStampedCodec(f'{number}').encode(5, values)).frame_id
     assert len(reader._frames) < 100
-    reader.decode(PoseStampedCodec('x' * LONGEST_FRAME).encode(5, values))
+    reader.decode(PoseStampedCodec('x' * MAX_FRAME_ID_LENGTH).encode(5, values))
     with pytest.raises(MessageError, match='at most') as refused:
-        reader.decode(PoseStampedCodec('x' * (LONGEST_FRAME + 1)).encode(5, values))
+        reader.decode(PoseStampedCodec('x' * (MAX_FRAME_ID_LENGTH + 1)).encode(5, values))
     assert refused.value.reason == 'frame_id too long'
     with pytest.raises(MessageError, match='wrong frame'):
         require_frame('tool/contact', 'x' * 100_000)
 
 
-def test_refusals_are_counted_by_topic_and_reason() -> None:
-    refusals = Refusals()
+def test_rejections_are_counted_by_topic_and_reason() -> None:
+    rejections = RejectionStatistics()
     for number in range(5):
-        refusals.add('tool/contact', MessageError('no such state', f'state {number}'))
-    refusals.add('cutting/cut', KeyError('x'))
-    assert refusals.values() == {
+        rejections.add('tool/contact', MessageError('no such state', f'state {number}'))
+    rejections.add('cutting/cut', KeyError('x'))
+    assert rejections.values() == {
         'refused tool/contact: no such state': 5,
         'refused cutting/cut: KeyError': 1,
     }
-    assert refusals.total == 6
+    assert rejections.total == 6
 
 
 def test_counts_and_lines_are_bounded_whatever_comes() -> None:
-    refusals = Refusals()
+    rejections = RejectionStatistics()
     for number in range(1000):
         text = f'{number} \n\x1b[31m{"x" * 100_000}'
-        refusals.add(f'topic{number}', MessageError('too large', text))
-    values = refusals.values()
-    assert len(values) == MOST_REASONS + 1
-    assert values[f'refused {OTHERS}'] == 1000 - MOST_REASONS
-    said = refusals.news()
+        rejections.add(f'topic{number}', MessageError('too large', text))
+    values = rejections.values()
+    assert len(values) == MAX_REASONS + 1
+    assert values[f'refused {OTHER_REASONS}'] == 1000 - MAX_REASONS
+    said = rejections.news()
     assert re.fullmatch(r'[ -~]+', said)
-    assert len(said) < LONGEST_SAID + 400
-    assert refusals.news() == ''
+    assert len(said) < MAX_REASON_LENGTH + 400
+    assert rejections.news() == ''
 
 
 def test_what_is_said_of_a_message_is_short_however_long_its_strings_are() -> None:
     with pytest.raises(MessageError, match='10000000 characters') as found:
         require_frame('tissue/mesh', 10_000_000 * 'x')
-    assert len(str(found.value)) < LONGEST_DETAIL + 100
-    assert len(str(MessageError('no such message', 10_000_000 * 'x'))) < LONGEST_DETAIL + 100
+    assert len(str(found.value)) < MAX_DETAIL_LENGTH + 100
+    assert len(str(MessageError('no such message', 10_000_000 * 'x'))) < MAX_DETAIL_LENGTH + 100
     machine = OperatingStateMachine()
-    assert len(machine.command(1_000_000 * 'x')) < LONGEST_DETAIL
+    assert len(machine.command(1_000_000 * 'x')) < MAX_DETAIL_LENGTH

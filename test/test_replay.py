@@ -22,14 +22,22 @@ from rclpy.qos import QoSCompatibility, qos_check_compatible
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Joy
 
-from bags.errors import BagError
-from bags.player import STEP, Playhead, ReadAhead, RecordedHand, RecordedStream, duration
-from bags.player_node import HandPlayer, SessionPlayer, publisher_qos
-from bags.reader import Bag, Recorded, open_bag
-from bags.topics import (
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.player import (
+    STEP_S,
+    Playhead,
+    ReadAhead,
+    RecordedHand,
+    RecordedStream,
+    duration,
+)
+from cutting_trainer.bags.player_node import HandPlayer, SessionPlayer, publisher_qos
+from cutting_trainer.bags.reader import Bag, Recorded, open_bag
+from cutting_trainer.bags.topics import (
     BUTTON,
     CONTACT,
     FORCE,
+    FORCES,
     MESH,
     OF_DEVICE,
     OF_TISSUE,
@@ -38,12 +46,12 @@ from bags.topics import (
     SERVO_CF,
     UPDATES,
 )
-from haptic_bridge.operating_state import crtk_types
-from session.domain import reserved_domain
-from session.errors import SessionError
-from session.recordings.replay import _Over, act_on, replay_nodes
-from tissue_sim import ros
-from tissue_sim.replica import MeshReplica
+from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.operating_state import crtk_types
+from cutting_trainer.recordings.replay import _Over, handle_keys, replay_nodes
+from cutting_trainer.session.domain import reserved_domain
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
 pytestmark = pytest.mark.real_time
 
@@ -68,7 +76,7 @@ def test_the_playhead_goes_by_the_clock_times_the_rate_and_stands_while_paused()
     head.toggle()
     assert head.move(105.0) == pytest.approx(3.0)
     head.step()
-    assert head.move(106.0) == pytest.approx(3.0 + STEP)
+    assert head.move(106.0) == pytest.approx(3.0 + STEP_S)
     head.toggle()
     assert head.move(200.0) == 9.0 and head.over
 
@@ -83,12 +91,12 @@ def test_a_loop_begins_again_where_the_replay_began() -> None:
 
 def test_keys_pause_step_and_end() -> None:
     head = Playhead(0.0, 9.0)
-    act_on(' ', head)
+    handle_keys(' ', head)
     assert not head.paused
-    act_on('xs', head)
-    assert head.paused and head.position == pytest.approx(STEP)
+    handle_keys('xs', head)
+    assert head.paused and head.position == pytest.approx(STEP_S)
     with pytest.raises(_Over):
-        act_on('q', head)
+        handle_keys('q', head)
 
 
 def test_a_stream_gives_every_message_once_in_order_and_none_early() -> None:
@@ -192,7 +200,9 @@ def test_nodes_of_a_replay_speak_to_no_device_unless_told_to() -> None:
         return [word for word in bridge.argv if ':=/replay' in word]
 
     of_device = ['arm/measured_cp:=/replay/arm/measured_cp', 'arm/button:=/replay/arm/button']
-    assert remapped(False) == [*of_device, 'arm/servo_cf:=/replay/arm/servo_cf']
+    forces = [f'{force[1:]}:=/replay{force}' for force in FORCES]
+    assert 'arm/servo_cf:=/replay/arm/servo_cf' in forces
+    assert remapped(False) == [*of_device, *forces]
     assert remapped(True) == of_device
 
 
@@ -249,7 +259,7 @@ def test_the_hand_goes_once_the_bridge_is_enabled_and_presses_its_button_again(
             time.sleep(0.01)
         time.sleep(0.2)
         hear()
-        assert playhead.over and player.refusal == '' and player.faulted is None
+        assert playhead.over and player.stop_reason == '' and player.faulted is None
         assert heard == [0, 1, 0]
     finally:
         player.stop()
@@ -281,9 +291,9 @@ def test_a_bridge_that_says_nothing_is_not_waited_for_for_ever(context: rclpy.Co
     try:
         player.watch(100.0)
         player.watch(129.0)
-        assert player.refusal == ''
+        assert player.stop_reason == ''
         player.watch(131.0)
-        assert player.refusal.startswith('the haptic bridge was not enabled within 30 s')
+        assert player.stop_reason.startswith('the haptic bridge was not enabled within 30 s')
     finally:
         player.stop()
 
@@ -301,8 +311,8 @@ def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
     player = SessionPlayer(context, playhead, bag, 0.0, drive_device=False)
     replica, heard = MeshReplica(), 0
     try:
-        player.refuse_live_input(player.topics)
-        assert player.refusal == ''
+        player.reject_live_input(player.topics)
+        assert player.stop_reason == ''
         player.advertise()
         time.sleep(1.0)
         playhead.toggle()
@@ -319,9 +329,9 @@ def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
         assert playhead.over and heard > 20 and replica.step > 100
         intruder = node.create_publisher(ForceSample, FORCE, ros.STREAM)
         deadline = time.monotonic() + 10.0
-        while not player.refusal and time.monotonic() < deadline:
+        while not player.stop_reason and time.monotonic() < deadline:
             time.sleep(0.05)
-        assert 'onlooker publishes /tissue/force' in player.refusal
+        assert 'onlooker publishes /tissue/force' in player.stop_reason
         node.destroy_publisher(intruder)
     finally:
         player.stop()
@@ -333,8 +343,8 @@ def test_a_replay_into_a_live_graph_is_refused_in_one_line(context: rclpy.Contex
     node.create_publisher(ForceSample, FORCE, ros.STREAM)
     player = SessionPlayer(context, Playhead(0.0, 1.0), open_bag(SAMPLE), 0.0, drive_device=False)
     try:
-        player.refuse_live_input(player.topics)
-        assert player.refusal.startswith('live_arm publishes /tissue/force')
+        player.reject_live_input(player.topics)
+        assert player.stop_reason.startswith('live_arm publishes /tissue/force')
     finally:
         player.stop()
         node.destroy_node()
@@ -352,7 +362,7 @@ class Terminal:
         self._settings = termios.tcgetattr(self._theirs)
         self._said = ''
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'session.cli', *arguments],
+            [sys.executable, '-m', 'cutting_trainer.cli', *arguments],
             cwd=ROOT,
             env=os.environ | {'TERM': 'xterm', 'COLUMNS': '120'},
             stdin=self._theirs,
@@ -395,7 +405,7 @@ def test_keys_of_a_terminal_pause_a_replay_step_it_and_end_it() -> None:
         terminal.press('s')
         while (stepped := float(terminal.wait_for(paused).group(1))) == stood:
             pass
-        assert stepped == pytest.approx(stood + STEP, abs=0.011)
+        assert stepped == pytest.approx(stood + STEP_S, abs=0.011)
         terminal.press('q')
         assert terminal.end() == 0
         assert terminal.is_as_before()
@@ -404,9 +414,17 @@ def test_keys_of_a_terminal_pause_a_replay_step_it_and_end_it() -> None:
         terminal.process.wait()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_recorded_hand_cuts_the_tissue_again(tmp_path: Path) -> None:
-    command = [sys.executable, '-m', 'session.cli', 'replay', str(SAMPLE), '--domain', 'free']
+    command = [
+        sys.executable,
+        '-m',
+        'cutting_trainer.cli.main',
+        'replay',
+        str(SAMPLE),
+        '--domain',
+        'free',
+    ]
     done = subprocess.run(
         [*command, '-o', str(tmp_path / 'bag')],
         cwd=ROOT,
@@ -425,7 +443,7 @@ def test_the_recorded_hand_cuts_the_tissue_again(tmp_path: Path) -> None:
 
 
 def test_a_start_beyond_the_end_is_refused() -> None:
-    from session.recordings.replay import ReplayOptions, replay
+    from cutting_trainer.recordings.replay import ReplayOptions, replay
 
     options = ReplayOptions(SAMPLE, True, 1.0, 1e4, False, 'free', None, False)
     with pytest.raises(SessionError, match='the session lasts'):

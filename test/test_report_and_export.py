@@ -11,20 +11,27 @@ import trimesh
 from meshes import box
 from pyarrow import parquet as pq
 
-from bags.errors import BagError
-from bags.reader import open_bag
-from bags.tissue import tissue_at
-from bags.topics import FORCE, MESH, SERVO_CF
-from haptic_bridge.wire import ForceSampleCodec
-from session.errors import SessionError
-from session.recordings.export import export
-from session.recordings.html_report import force_peaks, incision_area, write_report
-from session.recordings.incision import distance_to_ways, extent, planned_ways, surface_length
-from session.recordings.recorded_scene import restore_scene
-from session.scene import load_scene
-from tissue_sim.depth import DepthGauge
-from tissue_sim.mesh import TetMesh
-from tissue_sim.replica import MeshReplica
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.tissue import tissue_at
+from cutting_trainer.bags.topics import FORCE, MESH, SERVO_CF
+from cutting_trainer.node_common.cdr_codec import ForceSampleCodec
+from cutting_trainer.recordings.export import export
+from cutting_trainer.recordings.html_report import force_peaks, incision_area, write_report
+from cutting_trainer.recordings.incision import (
+    distance_to_paths,
+    extent,
+    planned_paths,
+    surface_length,
+)
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+
+pytestmark = pytest.mark.long
 
 SAMPLES = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_2'
 CUT, PALPATION = SAMPLES / 'straight_cut', SAMPLES / 'palpation'
@@ -56,7 +63,7 @@ def test_the_length_of_an_incision_is_half_of_its_lips() -> None:
 def test_depth_is_the_distance_under_the_free_surface() -> None:
     points = np.array([[0.02, 0.01, 0.017], [0.02, 0.01, 0.025], [0.02, 0.0115, 0.001]])
     np.testing.assert_allclose(
-        DepthGauge(block_of()).depths(points), [0.003, 0.0, 0.0085], atol=1e-12
+        SurfaceDepth(block_of()).depths(points), [0.003, 0.0, 0.0085], atol=1e-12
     )
 
 
@@ -64,7 +71,7 @@ def test_distance_to_the_plan_is_seen_from_above() -> None:
     way = np.array([[0.0, 0.0, 0.1], [0.1, 0.0, 0.0], [0.05, 0.0, 0.0]])
     assert extent(way) == pytest.approx(0.1)
     points = np.array([[0.05, 0.01, 0.3], [-0.03, 0.04, 0.0]])
-    np.testing.assert_allclose(distance_to_ways(points, [way]), [0.01, 0.05])
+    np.testing.assert_allclose(distance_to_paths(points, [way]), [0.01, 0.05])
 
 
 def test_peaks_are_the_largest_of_their_half_second() -> None:
@@ -78,10 +85,10 @@ def test_peaks_are_the_largest_of_their_half_second() -> None:
 
 def test_the_plan_is_the_way_of_the_phases_that_cut(tmp_path: Path) -> None:
     scene = load_scene(str(restore_scene(open_bag(CUT), tmp_path)))
-    (way,) = planned_ways(scene.arm.script)
+    (way,) = planned_paths(scene.arm.script)
     assert extent(way) == pytest.approx(0.026)
     scene = load_scene(str(restore_scene(open_bag(PALPATION), tmp_path)))
-    assert planned_ways(scene.arm.script) == []
+    assert planned_paths(scene.arm.script) == []
 
 
 def test_a_page_is_one_file_with_the_figures_of_the_cut(tmp_path: Path) -> None:
@@ -160,7 +167,7 @@ def test_the_exported_surface_is_closed_and_holds_the_volume(tmp_path: Path, end
 
 
 def test_outputs_that_cannot_be_are_refused_in_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(SessionError, match='a mesh ends in'):
+    with pytest.raises(SessionError, match='a mesh file ends in'):
         export(CUT, tmp_path / 'mesh.obj', None)
     with pytest.raises(SessionError, match='does not exist'):
         export(CUT, tmp_path / 'none' / 'mesh.vtk', None)

@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,22 +12,29 @@ import yaml
 from bag_copies import moved_by, rewritten
 from made_session import make_session
 from rclpy.serialization import deserialize_message, serialize_message
+from rich.console import Console
 
-from bags.comparison import ROUNDING, Comparison, compare
-from bags.errors import BagError
-from bags.frames import read_frames
-from bags.message_class import message_class
-from bags.reader import Recorded, open_bag
-from bags.repair import copy_bag
-from bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, UPDATES
-from haptic_bridge.wire import ContactCodec, ForceSampleCodec
-from session import cli
-from session.errors import SessionError
-from session.recordings.experiment import Run, run_experiment
-from session.recordings.recorded_scene import parse_changes, restore_scene
-from session.recordings.resimulate import pose_check, recomputation, verdict
-from session.scene import load_scene
-from tissue_sim.stamps import nanoseconds
+from cutting_trainer.bags.comparison import MAX_ROUNDING, Comparison, compare
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.frames import read_frames
+from cutting_trainer.bags.message_class import message_class
+from cutting_trainer.bags.reader import Recorded, open_bag
+from cutting_trainer.bags.repair import copy_bag
+from cutting_trainer.bags.resimulation import answer_frames, as_recorded
+from cutting_trainer.bags.topics import CONTACT, CUTS, FORCE, INPUTS, MESH, POSE, SERVO_CF, UPDATES
+from cutting_trainer.cli import main as cli
+from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec, WrenchStampedCodec
+from cutting_trainer.node_common.code_identity import identity_here
+from cutting_trainer.node_common.stamps import nanoseconds
+from cutting_trainer.recordings import view_bag
+from cutting_trainer.recordings.experiment import Run, recorded_run, run_experiment
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate import pose_check, recomputation, verdict
+from cutting_trainer.session.changed_scene import parse_changes
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.scene import load_scene
+
+pytestmark = pytest.mark.long
 
 SAMPLES = Path(__file__).parents[1] / 'bags' / 'samples'
 OF_TISSUE = (INPUTS, MESH, UPDATES, FORCE)
@@ -174,7 +182,7 @@ def test_frames_lost_by_the_recorder_end_the_computation_with_their_number(
     result = resimulated(rewritten(made, tmp_path / 'bag', change), tmp_path)
     assert result.frames == 29
     assert result.difference is not None and 'lacks frame 30' in result.difference.what
-    assert verdict(result, 1.0)[0].startswith('identical for 29 frames; ')
+    assert verdict(result, 1.0, None)[0].startswith('identical for 29 frames; ')
 
 
 @pytest.mark.parametrize('back', [0, 7])
@@ -218,15 +226,22 @@ def test_a_session_in_which_the_simulation_was_started_again_is_compared_up_to_t
     assert 'not compared: tissue_sim was started again' in said
 
 
-def test_a_bag_that_begins_in_the_middle_or_has_no_scene_is_refused(tmp_path: Path) -> None:
+def test_a_bag_of_format_2_that_begins_in_the_middle_says_why_it_is_not_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bag = open_bag(CUT)
-    late = rewritten(
-        CUT,
-        tmp_path / 'late',
-        lambda m: None if m.topic == MESH and bag.read(m).step == 0 else m.data,
-    )
-    with pytest.raises(BagError, match='begins at frame'):
-        restore_scene(open_bag(late), tmp_path)
+    middle = [m.log_time for m in bag.messages([INPUTS])][30]
+    late = rewritten(CUT, tmp_path / 'late', lambda m: m.data if m.log_time > middle else None)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(['resimulate', str(late)])
+    assert stopped.value.code == 2
+    assert 'begins at frame 3' in (said := capsys.readouterr().err) and 'from format 3 on' in said
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(['report', str(late), '-o', str(tmp_path / 'report.html')])
+    assert stopped.value.code in (0, None)
+
+
+def test_a_bag_without_a_scene_is_refused(tmp_path: Path) -> None:
     nameless = open_bag(CUT)
     del nameless.custom_data['scene']
     with pytest.raises(BagError, match='has no scene'):
@@ -250,25 +265,36 @@ def test_a_planned_method_is_that_which_the_bag_names_and_none_that_is_planned_a
     bag.custom_data['parameters'] = yaml.safe_dump({'/tissue_sim': {'seed': 0, **taken}})
     tissue = load_scene(str(restore_scene(bag, tmp_path))).tissue
     assert tissue.method == 'given'
-    assert tissue.method_taken == taken
+    assert tissue.method_taken == taken | {'contact': 'triangle'}
     changes = parse_changes(['tissue.model=linear'])
     assert load_scene(str(restore_scene(bag, tmp_path, changes))).tissue.model == 'linear'
     del bag.custom_data['parameters']
-    with pytest.raises(SessionError, match='the bag does not say what was planned'):
+    with pytest.raises(SessionError, match='the bag does not name the planned method'):
         recomputation(load_scene(str(restore_scene(bag, tmp_path))))
+
+
+@pytest.mark.parametrize('said', [{}, {'contact': 'footprint'}])
+def test_a_session_that_does_not_name_its_contact_had_that_of_triangles(
+    tmp_path: Path, said: dict[str, str]
+) -> None:
+    bag = open_bag(CUT)
+    bag.custom_data['parameters'] = yaml.safe_dump({'/tissue_sim': {'seed': 0, **said}})
+    tissue = load_scene(str(restore_scene(bag, tmp_path))).tissue
+    assert tissue.contact == said.get('contact', 'triangle')
+
+
+def with_changes(temporary: Path, *changes: str) -> Run:
+    bag = open_bag(CUT)
+    scene = load_scene(str(restore_scene(bag, temporary, parse_changes(list(changes)))))
+    return run_experiment(bag, scene, recomputation(scene))
 
 
 def test_the_same_hand_on_the_same_tissue_gives_the_same_and_on_a_tougher_one_more_force(
     tmp_path: Path,
 ) -> None:
-    def run(*changes: str) -> Run:
-        bag = open_bag(CUT)
-        scene = load_scene(str(restore_scene(bag, tmp_path, parse_changes(list(changes)))))
-        return run_experiment(bag, scene, recomputation(scene))
-
-    first, second = run(), run()
+    first, second = with_changes(tmp_path), with_changes(tmp_path)
     np.testing.assert_array_equal(first.forces, second.forces)
-    tougher = run('tissue.material.toughness=12')
+    tougher = with_changes(tmp_path, 'tissue.material.toughness=12')
     assert tougher.mean > 1.2 * first.mean
     assert first.area > 0.5e-4
     # What the hand felt live is met by the open-ended computation but for the timing of frames.
@@ -276,6 +302,41 @@ def test_the_same_hand_on_the_same_tissue_gives_the_same_and_on_a_tougher_one_mo
     for m in open_bag(CUT).messages([FORCE]):
         live.append(np.linalg.norm(codec.decode(m.data).values[codec.fields['force']]))
     assert first.peak == pytest.approx(max(live), rel=0.3)
+
+
+@pytest.mark.parametrize('name', ['straight_cut', 'crossing_cuts'])
+def test_beside_a_changed_session_stands_the_recorded_one(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its cuts as its service reported them, its force as it was commanded."""
+    folder = NEWEST / name
+    bag = open_bag(folder)
+    reports = [r.report for m in bag.messages([CUTS]) for r in bag.read(m).response]
+    codec = WrenchStampedCodec()
+    commands = [
+        codec.decode(m.data).values[codec.fields['force']] for m in bag.messages([SERVO_CF])
+    ]
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(['resimulate', str(folder), '--with', 'tissue.material.toughness=30', '--json'])
+    assert stopped.value.code == 0
+    told = json.loads(capsys.readouterr().out)
+    recorded = told['recorded']
+    assert recorded['elements_cut'] == sum(report.removed for report in reports) > 100
+    assert recorded['incision_area'] == pytest.approx(sum(r.area for r in reports), rel=1e-12)
+    assert recorded['largest_force'] == max(np.linalg.norm(commands, axis=1))
+    assert told['changed']['elements_cut'] != recorded['elements_cut']
+    assert told['differs_from_frame'] is None
+
+
+def test_cuts_of_a_changed_session_are_answered_by_the_protocol_of_its_bag(made: Path) -> None:
+    """Of bags before format 3: as late as the cut before was."""
+    answer = {'step': 1, 'cut_step': 0, 'answer_frames': 0}
+    old = [{}, {'step': 12, 'cut_step': 10}, {'step': 25, 'cut_step': 20}]
+    frames = answer_frames([SimpleNamespace(**answer | record) for record in old])
+    assert [frames(step) for step in (5, 10, 19, 20, 99)] == [2, 2, 2, 5, 5]
+    assert answer_frames(read_frames(open_bag(made)))(7) == 1
+    fixed = [SimpleNamespace(**answer | record | {'answer_frames': 2}) for record in old]
+    assert answer_frames(fixed)(20) == 2
 
 
 def test_a_change_that_names_nothing_in_the_scene_is_one_line(
@@ -305,16 +366,25 @@ def test_what_another_processor_rounds_is_told_and_what_is_more_differs(
 
     result = resimulated(rewritten(made, tmp_path / 'bag', change), tmp_path)
     assert not result.identical
-    said = verdict(result, 1.0)
-    if share > ROUNDING:
+    said = verdict(result, 1.0, identity_here())
+    if share > MAX_ROUNDING:
         assert result.difference is not None and result.difference.step == frame.step
         assert said[0].startswith('differs first')
         return
     assert result.difference is None and result.frames == len(read_frames(open_bag(made)))
     assert result.rounding is not None and result.rounding.step == frame.step
     assert result.largest == pytest.approx(share, rel=0.01)
-    assert said[0] == 'identical but for rounding'
-    assert f'from frame {frame.step} ' in said[-1] and 'stiffness differs by' in said[-1]
+    assert said[0] == 'not identical: off by no more than 1e-13 of the recorded values'
+    assert f'from frame {frame.step} ' in said[-2] and 'stiffness differs by' in said[-2]
+    assert said[-1] == 'kernels, libraries and processor are those that the bag names'
+    other = replace(identity_here(), target='another', cpu='Another CPU')
+    said = verdict(result, 1.0, other)
+    assert said[0] == 'identical but for rounding, as other processors and libraries do'
+    assert said[-1].startswith('the processor is another one: bag Another CPU (another), here ')
+    said = verdict(result, 1.0, replace(other, kernels='0123456789abcdef'))
+    assert said[0].startswith('not identical: off by no more than ')
+    assert said[-2].startswith("the trainer's own kernels have changed: bag 0123456789ab")
+    assert 'does not name its code' in verdict(result, 1.0, None)[-1]
 
 
 def test_the_command_says_identical(
@@ -329,6 +399,28 @@ def test_the_command_says_identical(
         cli.main(['resimulate', str(made), '--json'])
     told = json.loads(capsys.readouterr().out)
     assert told['identical'] and told['difference'] is None and told['frames'] > 0
+
+
+def test_a_frame_that_the_bag_lacks_ends_every_computation_in_one_sentence(
+    made: Path, tmp_path: Path
+) -> None:
+    source, gone = open_bag(made), loaded_frame(made, 0.5)
+
+    def change(m: Recorded) -> bytes | None:
+        lost = m.topic == INPUTS and source.read(m).step == gone.step
+        return None if lost else m.data
+
+    bag = open_bag(rewritten(made, tmp_path / 'bag', change))
+    scene = load_scene(str(restore_scene(bag, tmp_path)))
+    lacks = f'lacks frame {gone.step}: '
+    for changed in (False, True):
+        with pytest.raises(BagError, match=lacks):
+            view_bag.resimulated(bag, scene, Console(quiet=True), changed=changed)
+    with pytest.raises(BagError, match=lacks):
+        recorded_run(bag, recomputation(scene))
+    left = [record for record in read_frames(source) if record.step != gone.step]
+    with pytest.raises(BagError, match=lacks):
+        list(as_recorded(left, recomputation(scene)))
 
 
 def test_a_copy_has_the_same_messages(tmp_path: Path) -> None:

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from haptic_bridge import safety
+from cutting_trainer.haptic_bridge import safety
+from cutting_trainer.haptic_bridge.devices.motion_gate import MotionGate
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0])
-NEW = np.inf
 components = st.floats(-50, 50)
 forces = st.tuples(components, components, components).map(np.array)
 
@@ -22,27 +22,69 @@ def vector(*values):
 def test_a_pose_with_a_number_that_is_none_is_refused(bad, where):
     pose = np.concatenate([vector(0.1, 0, 0), UNIT])
     pose[where] = bad
-    assert safety.pose_gate(pose[:3], pose[3:], np.zeros(3), NEW) == safety.NOT_FINITE
+    assert safety.pose_gate(pose[:3], pose[3:]) == safety.NOT_FINITE
 
 
 @pytest.mark.parametrize('scale', [0.0, 0.9, 1.1])
 def test_an_orientation_that_is_no_rotation_is_refused(scale):
-    gate = safety.pose_gate(np.zeros(3), scale * UNIT, np.zeros(3), NEW)
+    gate = safety.pose_gate(np.zeros(3), scale * UNIT)
     assert gate == safety.NOT_A_ROTATION
 
 
 def test_millimetres_sent_as_metres_are_refused():
-    assert safety.pose_gate(vector(0, 0, 120), UNIT, np.zeros(3), NEW) == safety.OUT_OF_RANGE
+    assert safety.pose_gate(vector(0, 0, 120), UNIT) == safety.OUT_OF_RANGE
+
+
+def moved(gate, ms, position=(0, 0, 0), turn=0.0):
+    """What the gate says of a pose at a time, turned about z by an angle [rad]."""
+    orientation = (0, 0, np.sin(turn / 2), np.cos(turn / 2))
+    pose = np.array([*position, *orientation])
+    return gate.judge(pose, 10**9 + round(ms * 1e6), known=ms > 0)
 
 
 def test_a_jump_of_a_metre_is_refused_and_the_fastest_hand_is_not():
-    assert safety.pose_gate(vector(1, 0, 0), UNIT, np.zeros(3), 1e-3) == safety.JUMP
-    assert safety.pose_gate(vector(0.005, 0, 0), UNIT, np.zeros(3), 1e-3) == safety.OK
-    assert safety.pose_gate(vector(1, 0, 0), UNIT, np.zeros(3), NEW) == safety.OK
+    gate = MotionGate()
+    assert moved(gate, 0) == safety.OK
+    assert moved(gate, 1, (1, 0, 0)) == safety.JUMP
+    assert moved(gate, 1, (0.005, 0, 0)) == safety.OK
+
+
+def test_a_step_faster_than_10_m_per_s_is_refused_in_a_single_sample():
+    gate = MotionGate()
+    moved(gate, 0)
+    assert moved(gate, 1, (0.0145, 0, 0)) == safety.JUMP
+    assert moved(gate, 1.001, (0.0099, 0, 0)) == safety.OK
+
+
+@pytest.mark.parametrize('sign', [1, -1])
+def test_a_glitch_of_90_degrees_is_refused_and_a_flick_of_the_wrist_is_not(sign):
+    gate = MotionGate()
+    moved(gate, 0)
+    assert moved(gate, 1, turn=np.pi / 2) == safety.ROTATION_JUMP
+    assert moved(gate, 1, turn=0.03) == safety.OK
+    same = sign * np.array([0, 0, np.sin(0.03), np.cos(0.03)]) * 0.991
+    assert gate.judge(np.array([0, 0, 0, *same]), 10**9 + 2_000_000, known=True) == safety.OK
+
+
+def test_jitter_of_stamps_is_no_jump_but_many_steps_with_the_same_stamp_are():
+    rng, gate = np.random.default_rng(1), MotionGate()
+    stamps = np.arange(1, 2000) + rng.uniform(-0.9, 0.0, 1999)
+    moved(gate, 0)
+    for i, ms in enumerate(np.maximum.accumulate(stamps)):  # 5 m/s, back and forth
+        assert moved(gate, ms, (0.005 * abs((i + 1) % 20 - 10) - 0.05, 0, 0)) == safety.OK
+    gate = MotionGate()
+    codes = [moved(gate, 0.01 * i, (0.008 * i, 0, 0)) for i in range(10)]
+    assert safety.JUMP in codes
 
 
 def test_every_pose_fault_has_a_sentence():
-    codes = (safety.NOT_FINITE, safety.NOT_A_ROTATION, safety.OUT_OF_RANGE, safety.JUMP)
+    codes = (
+        safety.NOT_FINITE,
+        safety.NOT_A_ROTATION,
+        safety.OUT_OF_RANGE,
+        safety.JUMP,
+        safety.ROTATION_JUMP,
+    )
     assert set(safety.POSE_FAULTS) == set(codes)
 
 

@@ -4,16 +4,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.long
+
 PRESS = """
 import numpy as np
-from session.scene import load_scene
-from tissue_sim.assembly import make_simulation
-from tissue_sim.contact import press_triangle
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.tissue_sim.assembly import make_simulation
+from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 
 simulation, _ = make_simulation(load_scene('flap').tissue)
 place, down = np.array([0.012, 0.0, 0.010]), np.array([0.0, 0.0, -1.0])
 for depth in 0.006 * np.sin(np.linspace(0.0, np.pi, 150)) ** 2:
-    simulation.frame(press_triangle(simulation.mesh, place, down, depth))
+    simulation.frame(indenter_contact(simulation.mesh, place, down, depth))
 print(simulation.displacement.tobytes().hex())
 """
 
@@ -31,5 +35,5 @@ def pressed(before: str) -> str:
 
 def test_a_turning_tissue_moves_the_same_bit_for_bit_in_a_process_that_has_loaded_kernels() -> None:
     # The planner's process has run all models by all integrators, that of a re-simulation one.
-    others = 'from tissue_sim.warm_up import warm_up\nwarm_up()\n'
+    others = 'from cutting_trainer.tissue_sim.warm_up import warm_up\nwarm_up()\n'
     assert pressed('') == pressed(others)

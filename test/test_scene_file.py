@@ -7,19 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haptic_bridge.arm_settings import ArmSettings
-from haptic_bridge.hand import compile_script
-from haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
+from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
+from cutting_trainer.haptic_bridge.settings import (
     DeviceSettings,
     HapticsSettings,
     ToolSettings,
     check_together,
 )
-from tissue_sim.errors import SceneError
-from tissue_sim.mesh_checks import FACES
-from tissue_sim.mesh_io import load_tissue
-from tissue_sim.scene_file import SECTIONS, SceneModel, read_section
-from tissue_sim.settings import TissueSettings
+from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.node_common.scene_file import SECTIONS, SceneModel, read_section
+from cutting_trainer.tissue_sim.assembly import load_tissue
+from cutting_trainer.tissue_sim.mesh.checks import FACES
+from cutting_trainer.tissue_sim.settings import TissueSettings
+
+pytestmark = pytest.mark.long
 
 SCENES = Path(__file__).resolve().parents[1] / 'config' / 'scenes'
 
@@ -66,6 +68,12 @@ BAD_EDITS = [
     ('negative', '3e-1', '-0.1', 4, ['poissons_ratio', '-0.1', 'greater than or equal to 0']),
     ('negative modulus', '3e-1', '0.3, youngs_modulus: -5', 4, ['youngs_modulus', '-5', '[Pa]']),
     ('modulus in kPa', '3e-1', '0.3, youngs_modulus: 5.4', 4, ['youngs_modulus', '5.4', '[Pa]']),
+    ('all shear relaxes', '3e-1', '0.3, prony: [[0.6, 1], [0.5, 2]]', 4, ['prony', '1.1', '0.95']),
+    ('time in ms', '3e-1', '0.3, prony: [[0.6, 0.001]]', 4, ['prony.0.1', '0.001', '[s]']),
+    ('three terms', '3e-1', '0.3, prony: [[0.1, 1], [0.1, 2], [0.1, 3]]', 4, ['prony', 'two']),
+    ('a term without time', '3e-1', '0.3, prony: [[0.1]]', 4, ['prony.0', 'tau']),
+    ('gravity in g', '  unit: mm', '  gravity: [0, 0, -981]', 3, ['gravity', '-981', '[m/s^2]']),
+    ('gravity as a number', '  unit: mm', '  gravity: -9.81', 3, ['gravity', '-9.81', '[m/s^2]']),
     ('density in g/cm^3', '3e-1', '0.3, density: 1.05', 4, ['density', '1.05', '[kg/m^3]']),
     ('NaN', '3e-1', '.nan', 4, ['poissons_ratio', 'NaN', 'finite']),
     ('infinite', '3e-1', '.inf', 4, ['poissons_ratio', 'Infinity', 'finite']),
@@ -123,6 +131,10 @@ def test_a_good_scene_is_read_with_paths_relative_to_it(tmp_path):
     assert settings.material.poissons_ratio == 0.3
     assert settings.fixed[1].box.max == (0.1, 1.0, 1.0)
     assert settings.integration.rate == 30
+    assert settings.material.prony == () and settings.gravity == (0.0, 0.0, 0.0)
+    text = GOOD.replace('3e-1', '3e-1, prony: [[0.3, 0.1], [0.2, 1]]')
+    viscous = read_section(write(tmp_path, text), 'tissue', TissueSettings)
+    assert viscous.material.prony == ((0.3, 0.1), (0.2, 1.0))
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from session import demo
-from session.demo import DemoOptions, run_demo
-from session.errors import SessionError
-from session.graph import MODULES
-from session.node_process import NodeCommand
-from session.status import Status
-from session.summary import Summary
+from cutting_trainer.session import demo
+from cutting_trainer.session.demo import DemoOptions, run_demo
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.graph import MODULES
+from cutting_trainer.session.node_process import NodeCommand
+from cutting_trainer.session.status import Status
+from cutting_trainer.session.summary import Summary
 
 FAKE = Path(__file__).with_name('fake_node.py')
 Run = Callable[..., Status]
@@ -44,7 +44,7 @@ def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
     summary = Summary('bag', True, 5.0, {}, 1.0, 1.0, 0.0, 0.0, 1, 1, {}, {})
     monkeypatch.setattr(demo, 'read_evidence', lambda folder: None)
     monkeypatch.setattr(demo, 'summarise', lambda evidence: summary)
-    monkeypatch.setattr(demo, 'expected_of', lambda scene: demo.Expected({}, cut=True))
+    monkeypatch.setattr(demo, 'expectations', lambda scene: demo.Expected({}, cut=True))
 
 
 @pytest.mark.usefixtures('perfect')
@@ -67,7 +67,7 @@ def test_dead_node_is_the_exit_status_even_of_a_session_that_finished(
 def test_script_that_never_ends_is_a_failure(
     run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demo, 'OVERTIME', -4.5)
+    monkeypatch.setattr(demo, 'MAX_OVERTIME_S', -4.5)
     assert run() == Status.FAILED
     assert 'did not finish its script' in capsys.readouterr().err
 

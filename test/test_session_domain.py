@@ -5,8 +5,8 @@ import socket
 
 import pytest
 
-from session.domain import LARGEST_DOMAIN, parse_domain, reserved_domain
-from session.errors import SessionError
+from cutting_trainer.session.domain import MAX_DOMAIN, parse_domain, reserved_domain
+from cutting_trainer.session.errors import SessionError
 
 DOMAIN = 83
 
@@ -31,7 +31,7 @@ def test_domain_is_free_again_after_its_session() -> None:
 def test_free_domains_of_two_sessions_differ() -> None:
     with reserved_domain('free') as first, reserved_domain('free') as second:
         assert first != second
-        assert min(first, second) >= 1 and max(first, second) <= LARGEST_DOMAIN
+        assert min(first, second) >= 1 and max(first, second) <= MAX_DOMAIN
 
 
 def test_domain_with_foreign_participants_is_not_free() -> None:

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bags.qos import OfferedQos
-from bags.writer import BagWriter
-from haptic_bridge.wire import ContactCodec, WrenchStampedCodec
-from session.evidence import Evidence, Status, read_evidence
-from session.judge import Expected, judge
-from session.processes import Death, Outcome
-from session.recordings.report import session_tables
-from session.summary import Summary, summarise
+from cutting_trainer.bags.qos import OfferedQos
+from cutting_trainer.bags.writer import BagWriter
+from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
+from cutting_trainer.session.evidence import Evidence, Status, read_evidence
+from cutting_trainer.session.judge import Expected, judge
+from cutting_trainer.session.outcome import Death, Outcome
+from cutting_trainer.session.report import session_tables
+from cutting_trainer.session.summary import Summary, summarise
 
 RATES = {'tissue_sim': 30.0, 'haptic_bridge': 1000.0}
 EXPECTED = Expected(RATES, cut=True)
@@ -193,7 +193,7 @@ def test_a_loop_that_got_no_turn_explains_an_error_and_is_none_by_itself() -> No
     evidence.statuses.append(status('haptic_bridge', 9.0, 2, 'no pose for 20 ms'))
     error, why = judge(summarise(evidence), FINISHED, EXPECTED)
     assert 'no pose' in error
-    assert 'haptic_bridge got no turn for 33 ms' in why
+    assert 'haptic_bridge did not run for 33 ms' in why
 
 
 def test_deaths_come_first_with_signal_and_time(good: Summary) -> None:

@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 from numba import njit
 
-from session.measure.bench_tissue import box, liver_material
-from tissue_sim.domains import NodeDomains
-from tissue_sim.elasticity import MODELS, ElasticModel, ModelName, internal_force
-from tissue_sim.simd import (
+from bench.speed.tissue import box, liver_material
+from cutting_trainer.tissue_sim.elasticity.models import (
+    MODELS,
+    ElasticModel,
+    ModelName,
+    internal_force,
+)
+from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import NodalSmoothing
+from cutting_trainer.tissue_sim.elasticity.simd import (
     add_three,
     load_four,
     load_three,
@@ -20,7 +25,9 @@ from tissue_sim.simd import (
     total,
     unpack,
 )
-from tissue_sim.tensor_mass import TensorMass
+from cutting_trainer.tissue_sim.elasticity.tensor_mass import TensorMass
+
+pytestmark = pytest.mark.long
 
 
 @njit
@@ -82,7 +89,7 @@ def test_arrays_reach_beyond_their_rows() -> None:
     """As the last three numbers of a row are read as four, however the rows have grown."""
     mesh = box(300)
     n = mesh.node_count
-    tensors, domains = TensorMass(mesh, 1.0, 1.0), NodeDomains(mesh, 1.0, 1.0)
+    tensors, domains = TensorMass(mesh, 1.0, 1.0), NodalSmoothing(mesh, 1.0, 1.0)
     for number in range(60):
         tensors.tensors.room[:n] = 0  # every row has outgrown its place
         domains._domains.room[:n] = 0

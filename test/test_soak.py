@@ -6,7 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from session.trials.soak import ALLOWANCE, WARM, Sample, grown, remove_old
+from bench.trials.soak import (
+    MAX_ABSOLUTE_GROWTH,
+    WARM_UP_SHARE,
+    Sample,
+    growth_failures,
+    remove_old,
+)
+
+pytestmark = pytest.mark.long
 
 HOUR = np.arange(0.0, 3600.0, 5.0)
 STEADY = {'memory [MB]': 200.0, 'threads': 12.0, 'file handles': 40.0}
@@ -23,8 +31,8 @@ def noisy(middle: float) -> np.ndarray:
 
 
 def test_noise_and_what_fills_at_the_start_are_no_growth() -> None:
-    filling = noisy(200.0) - np.where(WARM * HOUR[-1] > HOUR, 100.0, 0.0)
-    assert not grown(watched('memory [MB]', filling))
+    filling = noisy(200.0) - np.where(WARM_UP_SHARE * HOUR[-1] > HOUR, 100.0, 0.0)
+    assert not growth_failures(watched('memory [MB]', filling))
 
 
 @pytest.mark.parametrize(
@@ -32,15 +40,15 @@ def test_noise_and_what_fills_at_the_start_are_no_growth() -> None:
 )
 def test_a_steady_leak_is_named(name: str, per_hour: float) -> None:
     leak = STEADY[name] + np.floor(per_hour * HOUR / HOUR[-1])
-    (said,) = grown(watched(name, leak))
+    (said,) = growth_failures(watched(name, leak))
     assert said.startswith(f'{name} of recorder grew from ')
 
 
 def test_entities_of_the_graph_may_not_pile_up() -> None:
     piled = [Sample(t, 'graph', {'DDS entities': 300 + t // 60}) for t in HOUR]
     level = [Sample(t, 'graph', {'DDS entities': 300 + t // 5 % 2}) for t in HOUR]
-    assert grown(piled) and not grown(level)
-    assert ALLOWANCE['DDS entities'] < 60
+    assert growth_failures(piled) and not growth_failures(level)
+    assert MAX_ABSOLUTE_GROWTH['DDS entities'] < 60
 
 
 def test_the_bag_that_is_being_written_is_kept_whatever_its_name(tmp_path: Path) -> None:

@@ -8,18 +8,18 @@ import pytest
 from meshes import box, irregular_box
 from test_blade import contact_at
 
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.blade import Resistance, Sweep
-from tissue_sim.coupling import PUSH, Coupling
-from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.elasticity import MODELS, ModelName
-from tissue_sim.guard import Guard
-from tissue_sim.integrators import INTEGRATORS, IntegratorName
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
-from tissue_sim.simulation import TissueSimulation
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
+from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling, Tool
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 every_model = pytest.mark.parametrize('name', MODELS)
 every_integrator = pytest.mark.parametrize('integrator', INTEGRATORS)
@@ -107,7 +107,7 @@ def test_frames_that_need_shorter_steps_one_after_another_do_not_get_longer_with
     tissue = simulation()
     usual = tissue.frame(None).substeps
     verdicts = itertools.cycle(['it diverges', ''])  # and the next attempt does not
-    monkeypatch.setattr(Guard, 'trouble', lambda *_: next(verdicts))
+    monkeypatch.setattr(DivergenceDetector, 'diagnose', lambda *_: next(verdicts))
     frames = [tissue.frame(None) for _ in range(6)]
     assert frames[0].substeps == 4 * usual and not frames[0].diverged
     assert max(frame.substeps for frame in frames) <= 16 * usual
@@ -126,12 +126,14 @@ def test_a_frame_that_is_taken_back_costs_so_many_frames_at_most(
     usual, spent = tissue.frame(None).substeps, []
     integrate = Dynamics._integrate
 
-    def counted(dynamics: Dynamics, coupling: Coupling, dt: float, substeps: int) -> float:
+    def counted(
+        dynamics: Dynamics, coupling: Coupling, dt: float, substeps: int, tool: Tool | None
+    ) -> float:
         spent.append(substeps)
-        return integrate(dynamics, coupling, dt, substeps)
+        return integrate(dynamics, coupling, dt, substeps, tool)
 
     monkeypatch.setattr(Dynamics, '_integrate', counted)
-    monkeypatch.setattr(Guard, 'trouble', lambda *_: 'it diverges')
+    monkeypatch.setattr(DivergenceDetector, 'diagnose', lambda *_: 'it diverges')
     assert tissue.frame(None).diverged
     assert sum(spent) == most * usual
 
@@ -227,14 +229,14 @@ def test_near_incompressibility_only_shortens_the_step(
 
 def test_energy_from_nowhere_is_found_before_it_is_large() -> None:
     nodes, tets = box((4, 4, 2), 0.01)
-    guard = Guard(TetMesh(nodes, tets), 5000.0)
+    guard = DivergenceDetector(TetMesh(nodes, tets), 5000.0)
     u = np.zeros_like(nodes)
-    assert guard.trouble(u, 1e-4, 1e-4) == ''
-    assert guard.trouble(u, 0.9e-4, -0.1e-4) == ''
-    assert 'the tool has put in' in guard.trouble(u, 5e-4, 0.1e-4)
-    assert guard.trouble(u, 1.2e-4, 0.5e-4) == ''
+    assert guard.diagnose(u, 1e-4, 1e-4) == ''
+    assert guard.diagnose(u, 0.9e-4, -0.1e-4) == ''
+    assert 'the tool has put in' in guard.diagnose(u, 5e-4, 0.1e-4)
+    assert guard.diagnose(u, 1.2e-4, 0.5e-4) == ''
     u[0] = np.nan
-    assert 'farther' in guard.trouble(u, np.nan, 0.0)
+    assert 'farther' in guard.diagnose(u, np.nan, 0.0)
 
 
 @pytest.mark.parametrize('active', [ActiveSettings(), ActiveSettings('on')], ids=['all', 'region'])

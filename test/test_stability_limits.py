@@ -12,16 +12,18 @@ import numpy as np
 import pytest
 from meshes import irregular_box
 
-from cutting.methods import make_method
-from cutting.settings import CuttingSettings
-from tissue_sim.blade import Sweep
-from tissue_sim.coupling import Coupling
-from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.elasticity import MODELS, ModelName
-from tissue_sim.integrators import INTEGRATORS, IntegratorName
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, TopologyDelta
-from tissue_sim.stability import step_bound
+from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.motion.stability import step_bound
+
+pytestmark = pytest.mark.long
 
 ALPHA, BETA = 5.0, 2e-4
 SIZE = 0.005

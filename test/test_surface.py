@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import distance, grid
 
-from haptic_bridge import half_spaces
-from haptic_bridge.neighbourhood import CAPACITY, NEAR, gather
-from haptic_bridge.surface import Surface
+from cutting_trainer.haptic_bridge.proxy import half_spaces
+from cutting_trainer.haptic_bridge.proxy.neighbourhood import CAPACITY, NEAR, gather
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
 
 
 def bumpy(points=20, seed=0):
@@ -18,7 +18,7 @@ def bumpy(points=20, seed=0):
     return grid(points, lambda x, y: rng.normal(0, 0.002, x.shape))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=20)
 @given(st.integers(0, 1000), st.floats(0, 1), st.sampled_from([1, 8, CAPACITY]))
 def test_nearest_triangles_are_those_of_brute_force_at_any_blend(seed, blend, most):
     rng = np.random.default_rng(seed)
@@ -72,7 +72,7 @@ def test_useless_arrays_are_refused_by_name():
         Surface(positions, triangles, revision=3, topology=0)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 @given(st.integers(0, 10**6), st.integers(1, 12))
 def test_projection_is_the_closest_of_all_points_that_planes_can_define(seed, count):
     rng = np.random.default_rng(seed)

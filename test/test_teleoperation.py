@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from haptic_bridge.force_path import ForcePath
-from haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
-from session.in_process import TICK, InProcess, LinkSettings, Tissue
-from session.measure.haptics_stability import (
-    COUPLING,
+from bench.haptics.stability import (
+    COUPLING_STIFFNESS,
     Cell,
     Outcome,
     Place,
@@ -17,6 +14,11 @@ from session.measure.haptics_stability import (
     run_place,
     tip_over,
 )
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.session.in_process import TICK_S, InProcess, LinkSettings, Tissue
+
+pytestmark = pytest.mark.long
 
 WORST = LinkSettings(delay=0.05, loss=0.05, jitter=0.01, seed=1)
 
@@ -34,11 +36,11 @@ def pressed(
         seconds: of the way.
     """
     device = DeviceSettings()
-    tool = ToolSettings(radius=0.004, coupling_stiffness=COUPLING)
+    tool = ToolSettings(radius=0.004, coupling_stiffness=COUPLING_STIFFNESS)
     path = ForcePath(tool, device, HapticsSettings(soft_start=0.0), device.load_profile())
     session = InProcess(path, Tissue(block(tissue)), 30.0, link)
     session.wait(0.1 + 2 * link.delay, tip_over(device, start))
-    part = np.minimum(np.arange(0, seconds + 0.5, TICK) / seconds, 1)
+    part = np.minimum(np.arange(0, seconds + 0.5, TICK_S) / seconds, 1)
     part = part**3 * (10 - 15 * part + 6 * part**2)
     wrenches = [session.tick(tip_over(device, h)).wrench for h in start - (start + depth) * part]
     return np.linalg.norm(np.array(wrenches)[:, :3], axis=1)

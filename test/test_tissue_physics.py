@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from meshes import box, irregular_box
 
-from tissue_sim.coupling import PUSH, Coupling
-from tissue_sim.elasticity import ElasticModel
-from tissue_sim.integrators import Integrator
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
-from tissue_sim.stability import FrequencyBound, step_bound
+from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.integrators import Integrator
+from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
+
+pytestmark = pytest.mark.long
 
 LIVER = Material(642.55, 0.47, 1050.0, 0.0, 0.0)
 

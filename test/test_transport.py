@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from live import ROOT, free_domain
 
-from session.graph import PROFILES, RANGE, discovery, node_environment
-from session.network import Network, network_environment
+from cutting_trainer.session.graph import PROFILES, RANGE, discovery, node_environment
+from cutting_trainer.session.network import Network, network_environment
 
 pytestmark = pytest.mark.real_time
 
@@ -25,7 +25,7 @@ TALK = """
 import os, sys, time
 import rclpy
 from std_msgs.msg import Header
-from tissue_sim.ros import STREAM
+from cutting_trainer.node_common.ros import STREAM
 
 role = sys.argv[1]
 rclpy.init()

@@ -15,10 +15,10 @@ from live import (
     write_scene,
 )
 
-from bench.impaired_link import missing_rights
-from bench.two_hosts import (
-    AWAY,
-    WORST,
+from bench.graph.impaired_link import missing_rights
+from bench.graph.two_hosts import (
+    INTERRUPTED_IMPAIRMENT,
+    INTERRUPTION_S,
     Ended,
     ages,
     checked_meshes,
@@ -28,6 +28,7 @@ from bench.two_hosts import (
 
 pytestmark = [
     pytest.mark.real_time,
+    pytest.mark.thorough,
     pytest.mark.skipif(bool(missing_rights()), reason=missing_rights()),
 ]
 SECONDS = 12.0
@@ -49,7 +50,7 @@ def palpate_and_cut() -> list[object]:
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     folder = tmp_path_factory.mktemp('hosts')
     scene = write_scene(folder, palpate_and_cut(), SECONDS, 0.2, 'combined')
-    return run_on_two_hosts(scene, folder, WORST, free_domain(), AWAY)
+    return run_on_two_hosts(scene, folder, INTERRUPTED_IMPAIRMENT, free_domain(), INTERRUPTION_S)
 
 
 @pytest.fixture(scope='module')
@@ -67,9 +68,9 @@ def test_the_session_completes_and_cuts(ended: Ended, recording: Recording) -> N
 
 
 def test_the_link_was_as_bad_as_it_was_asked_to_be(recording: Recording) -> None:
-    assert ages(recording.bag, TISSUE_FORCE).min() > WORST.delay
+    assert ages(recording.bag, TISSUE_FORCE).min() > INTERRUPTED_IMPAIRMENT.delay
     frames = [m.log_time * 1e-9 for m in recording.messages('/tissue/frame_inputs')]
-    assert max(b - a for a, b in pairwise(frames)) > AWAY[1] - 0.5
+    assert max(b - a for a, b in pairwise(frames)) > INTERRUPTION_S[1] - 0.5
 
 
 def test_every_force_is_safe_and_it_fades_while_the_link_is_away(recording: Recording) -> None:

@@ -14,9 +14,9 @@ import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from ruamel.yaml import YAML
 
-from session.topic_reference import TOPICS, Topic
-from tissue_sim.ros import FRAME
-from viewer.frames import DEVICE_FRAME
+from bench.reference.topics import TOPICS, Topic
+from cutting_trainer.node_common.ros import FRAME
+from cutting_trainer.viewer.frames import DEVICE_FRAME
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
 PUBLISHED = {f'/{topic.name.lstrip("/")}': topic for topic in TOPICS}
@@ -78,7 +78,7 @@ def test_rviz_is_in_frames_that_there_are_and_shows_every_marker(rviz: Any) -> N
             assert all(display['Namespaces'].values())
     assert named <= FRAMES
     # Markers are in the fixed frame: they are seen without any transform.
-    assert manager['Global Options']['Fixed Frame'] == PUBLISHED['/viewer/markers'].frame
+    assert manager['Global Options']['Fixed Frame'] == FRAME
 
 
 def panels(foxglove: Any, kind: str) -> list[Any]:

@@ -15,16 +15,16 @@ from scipy.spatial.transform import Rotation
 from strokes import draw, mesh_of, method_named, straight
 from visualization_msgs.msg import Marker, MarkerArray
 
-from haptic_bridge.chain import TOUCHING
-from haptic_bridge.settings import DeviceSettings, ToolSettings, Vector
-from tissue_sim.messages import mesh_message
-from tissue_sim.replica import MeshReplica
-from tissue_sim.ros import LATCHED, STATIC_FRAMES
-from viewer import frames
-from viewer.frames import StaticFrames, device_frame, publishing_command
-from viewer.markers import Colouring, Markers, shades, von_mises
-from viewer.moment import Moment
-from viewer.stage import METRES_A_NEWTON, OPENED, blade, handle
+from cutting_trainer.haptic_bridge.chain import TOUCHING
+from cutting_trainer.haptic_bridge.settings import DeviceSettings, ToolSettings, Vector
+from cutting_trainer.node_common.ros import LATCHED, STATIC_FRAMES
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.streaming.messages import mesh_message
+from cutting_trainer.viewer import frames
+from cutting_trainer.viewer.frames import StaticFrames, device_frame, publishing_command
+from cutting_trainer.viewer.markers import Colouring, Markers, shades, von_mises
+from cutting_trainer.viewer.moment import Moment
+from cutting_trainer.viewer.shapes import METRES_PER_NEWTON, OPENED, blade, handle
 
 LARGEST = 0.004
 STAMP = 12_000_000_034
@@ -50,7 +50,7 @@ def replica() -> MeshReplica:
 def moment() -> Moment:
     return Moment(
         tip=np.array([0.01, 0.02, 0.03]),
-        turn=np.array([1.0, 0.0, 0.0, 0.0]),
+        orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         blade=np.array([[0.01, 0.02, 0.05], [0.01, 0.02, 0.026]]),
         proxy=np.array([0.01, 0.02, 0.034]),
         contact=TOUCHING,
@@ -125,7 +125,7 @@ def test_tool_proxy_and_force_are_where_they_are(replica, moment):
     assert markers['proxy'].scale.x == markers['proxy'].scale.z == 0.008
     begin, end = xyz(markers['force'].points)
     np.testing.assert_allclose(begin, moment.tip)
-    np.testing.assert_allclose(end - begin, METRES_A_NEWTON * FORCE)
+    np.testing.assert_allclose(end - begin, METRES_PER_NEWTON * FORCE)
 
 
 def test_what_is_not_there_is_taken_from_the_screen(replica, moment):
@@ -192,7 +192,7 @@ def test_static_frames_are_those_of_the_drivers_poses_and_of_the_scene_that_runs
     talker: Any = Talker()
     static = StaticFrames(talker, placed(0.0))
     for name in ('arm_base', 'tissue', '', 'MTML_base', 'MTML_base'):
-        static.learn(name)
+        static.add_frame(name)
     static.place(placed(0.1))
     said = [
         [(t.header.frame_id, t.child_frame_id, t.transform.translation.x) for t in transforms]
@@ -203,10 +203,20 @@ def test_static_frames_are_those_of_the_drivers_poses_and_of_the_scene_that_runs
     assert said[1:] == [[('tissue', name, x) for name in both] for x in (0.0, 0.1)]
 
 
+def test_frames_that_another_node_owns_get_no_second_parent(monkeypatch):
+    for kind in (SimpleNamespace, None):
+        monkeypatch.setattr(frames, 'TFMessage', kind)
+        talker: Any = Talker()
+        static = StaticFrames(talker, placed(0.0), publish=False)
+        static.add_frame('MTML_base')
+        static.place(placed(0.1))
+        assert not talker.published and not talker.said
+
+
 def test_without_tf2_msgs_the_viewer_says_what_publishes_the_frame(monkeypatch):
     monkeypatch.setattr(frames, 'TFMessage', None)
     talker: Any = Talker()
-    StaticFrames(talker, placed(0.1)).learn('MTML_base')
+    StaticFrames(talker, placed(0.1)).add_frame('MTML_base')
     (said,) = talker.said
     assert said.endswith(publishing_command(device_frame(placed(0.1))))
     words = said[said.index('ros2 run tf2_ros static_transform_publisher') :].split()

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,26 +12,28 @@ from bag_copies import rewritten
 from made_session import make_session
 from rich.console import Console
 
-from bags.errors import BagError
-from bags.player import duration
-from bags.reader import Bag, Recorded, open_bag
-from bags.tissue import tissue_at
-from bags.topics import CONTACT
-from bench.browser import CHROMIUM, chromium
-from bench.open_page import OpenPage
-from haptic_bridge.wire import ContactCodec
-from session.recordings.picture import read_story
-from session.recordings.recorded_scene import restore_scene
-from session.recordings.view_bag import resimulated
-from session.scene import Scene, load_scene
-from viewer.page import addresses
-from viewer.replay_page import ReplayPage
-from viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
+from bench.page.browser import CHROMIUM, chromium
+from bench.page.open_page import OpenPage
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.player import duration
+from cutting_trainer.bags.reader import Bag, Recorded, open_bag
+from cutting_trainer.bags.tissue import tissue_at
+from cutting_trainer.bags.topics import CONTACT
+from cutting_trainer.node_common.cdr_codec import ContactCodec
+from cutting_trainer.recordings.picture import read_story
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.view_bag import resimulated
+from cutting_trainer.session.graph import LOCAL
+from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.viewer.gate import link, make_gate
+from cutting_trainer.viewer.replay_page import ReplayPage
+from cutting_trainer.viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.long
 
 CUT = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 NOTES = Console(quiet=True)
+GATE = make_gate(LOCAL, [])
 
 
 @pytest.fixture(scope='module')
@@ -105,73 +108,96 @@ def test_changed_tissue_goes_another_way(bag: Bag, scene: Scene, tmp_path: Path)
 
 @pytest.fixture
 def page(bag: Bag, scene: Scene, again: ComputedTissue) -> Iterator[ReplayPage]:
-    page = ReplayPage(bag, scene.tool, scene.device, again, 'computed again', '127.0.0.1', 0)
+    page = ReplayPage(bag, scene.tool, scene.device, again, 'computed again', LOCAL, 0, GATE)
     yield page
     page.server.stop()
 
 
+def url(page: ReplayPage) -> str:
+    return link(LOCAL, page.server.port, [], GATE.token)
+
+
 def test_page_goes_where_the_time_line_is_put(page: ReplayPage, bag: Bag) -> None:
-    end = duration(bag)
-    reader = OpenPage(addresses(page.server))
-    page.show(0.8 * end, 0.0)
-    scene = page.server.scene
-    moved = scene.get_handle_by_name('/tissue/0').vertices
-    late = RecordedTissue(bag).go_to(0.8 * end)
-    used = np.unique(late.triangles[late.triangle_kind == 0])
-    np.testing.assert_allclose(moved, late.positions()[used], atol=1e-7)
-    beside = scene.get_handle_by_name('/computed/0').vertices
-    np.testing.assert_allclose(beside, moved, atol=1e-7)
-    tip = RecordedTool(bag).contact.at(0.8 * end)
-    assert tip is not None
-    np.testing.assert_allclose(
-        scene.get_handle_by_name('/tool').position, tip.values[ContactCodec.fields['device']]
-    )
-    page.show(0.0, 1.0)
-    first = RecordedTissue(bag).go_to(0.0)
-    shown = scene.get_handle_by_name('/tissue/0').vertices
-    np.testing.assert_allclose(shown, first.positions()[np.unique(first.triangles)], atol=1e-7)
+    end, tool = duration(bag), RecordedTool(bag)
+    reader = OpenPage(url(page))
+    for share in (0.8, 0.1, 0.4):
+        reader.ask('seek', time=share * end)
+        wanted = RecordedTissue(bag).go_to(share * end)
+        contact = tool.contact.at(share * end)
+        assert contact is not None
+        tip = contact.values[ContactCodec.fields['device']]
+
+        def shows(tip: object = tip) -> bool:
+            page.update(time.monotonic())
+            return np.array_equal(reader.values.get('moment', {}).get('tip'), tip)
+
+        reader.wait(shows, 'the moment')
+        used = np.unique(wanted.triangles[wanted.triangle_kind == 0])
+        for name in ('tissue', 'computed'):
+            moved = reader.values[name][0][0]
+            np.testing.assert_allclose(moved, wanted.positions()[used], atol=1e-6)
     reader.close()
 
 
-@pytest.mark.slow
+def test_page_plays_at_the_speed_that_was_chosen_and_begins_anew_at_the_end(
+    page: ReplayPage, bag: Bag
+) -> None:
+    end = duration(bag)
+    reader = OpenPage(url(page))
+
+    def at(now: float) -> float:
+        page.update(now)
+        return float(page._playhead.position)
+
+    def shown() -> dict[str, Any]:
+        return reader.values.get('playhead', {})
+
+    reader.ask('speed', value=2.0)
+    reader.ask('play', on=True)
+    reader.wait(lambda: not (at(0.0), page._playhead.paused)[1], 'the play')
+    began = at(0.0)
+    assert at(0.5) == pytest.approx(began + 1.0)
+    at(2 * end)
+    reader.wait(lambda: shown().get('playing') is False, 'the end')
+    assert shown()['time'] == pytest.approx(end, abs=0.01)
+    reader.ask('play', on=True)
+    reader.wait(lambda: at(2 * end) < 0.5 * end, 'the beginning again')
+    reader.close()
+
+
+@pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason='chromium is not installed: sudo apt install chromium')
 def test_time_line_is_moved_played_and_paused_by_clicks(page: ReplayPage, bag: Bag) -> None:
-    end, tool = duration(bag), RecordedTool(bag)
-    line = "+document.querySelector('[role=slider]').ariaValueNow"
+    end = duration(bag)
     ended: list[bool] = []
     thread = Thread(target=page.run, args=(lambda: bool(ended),))
     thread.start()
-
-    def shows(seconds: float) -> bool:
-        contact = tool.contact.at(seconds)
-        tip = page.server.scene.get_handle_by_name('/tool').position
-        return contact is not None and np.array_equal(
-            tip, contact.values[ContactCodec.fields['device']]
-        )
-
     try:
         with chromium((1060, 640), coarseness=2) as browser:
-            seen = browser.page(addresses(page.server))
-            seen.wait(lambda: seen.says('Play'), 'the page')
-            seen.slide(0.6)
-            seen.wait(lambda: seen.evaluate(line) > 0.5 * end, 'the time line')
-            seen.wait(lambda: shows(seen.evaluate(line)), 'the moment')
+            seen = browser.page(url(page))
+
+            def head() -> Any:
+                return seen.state().get('playhead') or {'time': -1.0, 'playing': None}
+
+            seen.wait(lambda: head()['time'] == 0.0, 'the page')
+            seen.slide('seek', 0.6)
+            seen.wait(lambda: head()['time'] > 0.5 * end, 'the time line')
             seen.wait(lambda: has_both(seen.picture()), 'two tissues, of two colours')
-            seen.choose('1 x', '0.1 x')
-            began, clock = seen.evaluate(line), time.monotonic()
-            seen.click('Play')
-            seen.wait(lambda: seen.evaluate(line) > began + 0.05, 'the session to go on')
-            assert seen.evaluate(line) - began < 0.2 * (time.monotonic() - clock)  # slowly
-            seen.click('Pause')
-            seen.wait(lambda: seen.says('Play'), 'the pause')
-            stands = page.server.scene.get_handle_by_name('/tool').position
+            seen.choose('speed', '0.1 ×')
+            began, clock = head()['time'], time.monotonic()
+            seen.press('play')
+            seen.wait(lambda: head()['time'] > began + 0.05, 'the session to go on')
+            assert head()['time'] - began < 0.2 * (time.monotonic() - clock)  # slowly
+            seen.press('play')
+            seen.wait(lambda: not head()['playing'], 'the pause')
+            stands = head()['time']
             time.sleep(0.5)
-            assert np.array_equal(page.server.scene.get_handle_by_name('/tool').position, stands)
-            seen.choose('0.1 x', '4 x')
-            seen.click('Play')
-            seen.wait(lambda: seen.says('Play') and shows(end), 'the end')
-            seen.click('Play')
-            seen.wait(lambda: seen.evaluate(line) < 0.5 * end, 'the beginning again')
+            assert head()['time'] == stands
+            seen.choose('speed', '4 ×')
+            seen.press('play')
+            seen.wait(lambda: not head()['playing'] and head()['time'] > 0.99 * end, 'the end')
+            seen.press('play')
+            seen.wait(lambda: head()['time'] < 0.5 * end, 'the beginning again')
     finally:
         ended.append(True)
         thread.join()
@@ -180,7 +206,7 @@ def test_time_line_is_moved_played_and_paused_by_clicks(page: ReplayPage, bag: B
 def has_both(picture: np.ndarray) -> bool:
     """Whether something of the recorded tissue's colour is seen, and of the computed one's."""
     r, _, b = picture.astype(int).transpose(2, 0, 1)
-    middle = np.s_[:, 330:720]  # between the panels
+    middle = np.s_[100:500, 20:700]
     return bool((r > b + 40)[middle].sum() > 500 and (b > r + 25)[middle].sum() > 500)
 
 

@@ -3,33 +3,71 @@
 import subprocess
 import sys
 
-LATER = """
-import sys
-import numpy as np
-from cutting.settings import CuttingSettings
-from cutting.warm_up import warm_up as warm_up_cutting
-from session.measure.bench_strokes import Session
-from session.measure.bench_tissue import box, liver_material
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.blade import Resistance
-from tissue_sim.contact import press_triangle
-from tissue_sim.dynamics import TimeStepping
-from tissue_sim.elasticity import MODELS
-from tissue_sim.simulation import TissueSimulation
-from tissue_sim.warm_up import warm_up
+import pytest
 
-def compiled():
-    kernels = {}
+pytestmark = pytest.mark.long
+
+COMPILED = """
+import sys
+
+def kernels():
+    found = {}
     for name, module in list(sys.modules.items()):
-        if name.split('.')[0] in ('tissue_sim', 'cutting', 'haptic_bridge'):
+        if name.startswith('cutting_trainer.'):
             for key, value in vars(module).items():
                 if hasattr(value, 'signatures') and value.__module__ == name:
-                    kernels[f'{name}.{key}'] = len(value.signatures)
-    return kernels
+                    found[f'{name}.{key}'] = value
+    return found
+
+def loaded():
+    return {name: len(kernel.signatures) for name, kernel in kernels().items()}
+
+def report(before):
+    found = {name: n for name, n in loaded().items() if n != before.get(name, 0)}
+    print('kernels:', len(before), 'loaded later:', found)
+"""
+IN_SESSION = """
+import numpy as np
+from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
+from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
+from cutting_trainer.haptic_bridge.warm_up import warm_up as warm_up_force_path
+from cutting_trainer.session.in_process import simulate
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.warm_up import warm_up_arm
+
+scene = load_scene(sys.argv[1])
+session = simulate(sys.argv[1])
+warm_up_arm()
+warm_up_cutting(scene.cutting)
+warm_up_force_path(scene.tool, scene.device, scene.haptics, scene.profile)
+before, seconds = loaded(), 6.0
+script = compile_script(scene.arm.script, scene.device.tissue_from_device, seconds)
+hand = EmulatedHand(scene.arm.hand, script)
+for tick in range(int(1000 * seconds)):
+    hand.move_to(1e-3 * tick, 1e-3 * tick)
+    session.tick(hand.position, tuple(hand.orientation))
+assert session.tissue.simulation.elements_cut > 0
+report(before)
+missing = {name: k.stats.cache_misses for name, k in kernels().items() if k.stats.cache_misses}
+print('not set up:', missing)
+"""
+MUCH_CUT = """
+import numpy as np
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
+from bench.speed.strokes import Session
+from bench.speed.tissue import box, liver_material
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.contact.tool import indenter_contact
+from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.elasticity.models import MODELS
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+from cutting_trainer.tissue_sim.warm_up import warm_up
 
 warm_up()
 warm_up_cutting(CuttingSettings())
-before = compiled()
+before = loaded()
 session = Session(12_000)  # more nodes than a patch has
 for _ in range(4):
     session.stroke()
@@ -46,16 +84,32 @@ for model in MODELS:
     )
     for depth in (1e-3, 2e-3):
         place = mesh.rest.max(axis=0) * [0.5, 0.5, 1.0]
-        simulation.frame(press_triangle(mesh, place, np.array([0.0, 0.0, -1.0]), depth))
+        simulation.frame(indenter_contact(mesh, place, np.array([0.0, 0.0, -1.0]), depth))
     assert simulation.dynamics.active_nodes == 100
-after = compiled()
-print({name: count for name, count in after.items() if count != before.get(name, 0)})
+report(before)
 """
 
 
-def test_warm_up_leaves_no_kernel_to_be_compiled_in_a_session() -> None:
+def said(program: str, *arguments: str) -> list[str]:
     done = subprocess.run(
-        [sys.executable, '-c', LATER], capture_output=True, text=True, check=False
+        [sys.executable, '-c', COMPILED + program, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == '{}\n'
+    return done.stdout.splitlines()
+
+
+@pytest.mark.parametrize('scene', ['liver', 'block'])
+def test_setup_has_compiled_and_nodes_have_loaded_all_that_a_session_calls(scene: str) -> None:
+    later, missing = said(IN_SESSION, scene)
+    kernels, found = later.split(' loaded later: ')
+    assert int(kernels.removeprefix('kernels: ')) > 80
+    assert found == '{}'
+    assert missing == 'not set up: {}'
+
+
+def test_warm_up_leaves_no_kernel_to_be_compiled_in_a_session() -> None:
+    (later,) = said(MUCH_CUT)
+    assert later.endswith(' loaded later: {}'), later

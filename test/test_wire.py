@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
-from haptic_bridge.wire import (
+from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
@@ -18,6 +18,8 @@ from haptic_bridge.wire import (
     WireError,
     WrenchStampedCodec,
 )
+
+pytestmark = pytest.mark.long
 
 CODECS = {
     PoseStampedCodec: PoseStamped,
@@ -93,6 +95,18 @@ def test_fields_are_named_as_in_the_message(codec):
             assert values[where] == (getattr(message.contact_stamp, part),)
         else:
             assert list(values[where]) == flat(getattr(message, name))
+
+
+@pytest.mark.parametrize('codec', [ContactCodec, ForceSampleCodec], ids=lambda c: c.__name__)
+def test_messages_of_older_bags_are_about_the_first_tool(codec):
+    values = tuple(range(1, sum(count for _, _, count in codec.layout)))
+    data = codec('tissue').encode(5, values)
+    assert codec().decode(data) == codec().decode(data[:-1]) == (5, 'tissue', (*values, 0))
+    for wrong in (values[:-1], (*values, 0, 0)):
+        with pytest.raises(WireError, match='flat numbers'):
+            codec('tissue').encode(5, wrong)
+    with pytest.raises(WireError, match='wrong length'):
+        codec().decode(data[:-2])
 
 
 def test_nan_and_infinity_pass_for_a_gate_behind_the_codec_to_judge():

@@ -1,32 +1,62 @@
-"""From what a scene says of its tissue to the tissue."""
+"""Assembly of a tissue simulation from the section `tissue` of a scene."""
 
 from dataclasses import asdict, replace
 
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.blade import Resistance
-from tissue_sim.candidate import Task
-from tissue_sim.dynamics import TimeStepping
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh
-from tissue_sim.mesh_io import load_tissue
-from tissue_sim.plan import Plan, plan
-from tissue_sim.replica import MeshReplica
-from tissue_sim.settings import ActiveRegion, TissueSettings
-from tissue_sim.simulation import TissueSimulation
-from tissue_sim.warm_up import warm_up
+import numpy as np
+from numpy.typing import NDArray
+
+from cutting_trainer.node_common.errors import MeshError
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.mesh.checks import check_mesh, select_fixed
+from cutting_trainer.tissue_sim.mesh.files import load_mesh
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.planner.candidate import Task
+from cutting_trainer.tissue_sim.planner.plan import Plan, plan
+from cutting_trainer.tissue_sim.settings import ActiveRegionSettings, TissueSettings
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+from cutting_trainer.tissue_sim.warm_up import warm_up, warm_up_method
 
 
-def make_task(settings: TissueSettings) -> Task:
-    """The scene as the planner sees it.
+def load_tissue(
+    settings: TissueSettings,
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.bool_]]:
+    """Read and check the mesh that a scene names.
+
+    Returns:
+        nodes [m], shape (n, 3); tetrahedra, positively oriented, shape (m, 4); and which nodes do
+        not move, shape (n,).
 
     Raises:
-        MeshError: the mesh cannot be used.
+        MeshError: one sentence with the file, the element or node, and the remedy.
     """
-    nodes, tetrahedra, fixed = load_tissue(settings)
+    nodes, tetrahedra = load_mesh(settings.mesh, settings.unit_scale)
+    try:
+        tetrahedra = check_mesh(nodes, tetrahedra)
+        return nodes, tetrahedra, select_fixed(nodes, tetrahedra, settings.fixed)
+    except MeshError as error:
+        raise MeshError(f'{settings.mesh}: {error}') from None
+
+
+def make_task(settings: TissueSettings, mesh: TetMesh | None = None) -> Task:
+    """Return the scene as a task for the planner.
+
+    Args:
+        settings: section `tissue` of the scene.
+        mesh: of the tissue; None: the scene's mesh.
+
+    Raises:
+        MeshError: the mesh is not valid.
+    """
     m, d, i = settings.material, settings.damping, settings.integration
     return Task(
-        TetMesh(nodes, tetrahedra, fixed),
-        Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
+        mesh or TetMesh(*load_tissue(settings)),
+        Material(
+            m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta, m.stiffening, m.prony
+        ),
         Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
         settings.budget,
         TimeStepping(
@@ -43,47 +73,53 @@ def make_task(settings: TissueSettings) -> Task:
 def make_simulation(
     settings: TissueSettings, before: MeshReplica | None = None
 ) -> tuple[TissueSimulation, Plan | None]:
-    """The simulation that a scene describes, and the plan it goes by if it asks for one.
+    """Return the simulation of a scene, and its plan if the scene asks for one.
 
-    Where no method fits the budget, the scene's own model, integrator and active region are taken.
+    If no method fits the budget, the scene's own model, integrator and active region are used.
 
     Args:
         settings: its section `tissue`.
-        before: the tissue as another simulation of this scene left it, to go on from.
+        before: state of the tissue in an earlier simulation of this scene, to continue from.
 
     Raises:
-        MeshError: the mesh cannot be used.
+        MeshError: the mesh is not valid, or has no shape at rest under its weight.
     """
-    # First of all: of a kernel that several others contain, a process runs the copy that it loaded
-    # first, and copies may differ in the last bit. Loaded in one order, they are always the same.
-    warm_up()
-    task = make_task(settings)
+    # This comes first, see there.
+    warm_up() if settings.method == 'auto' else warm_up_method(settings.integrator)
+    # A cut mesh has coincident nodes, which the checks of a scene's mesh refuse.
+    mesh = None if before is None else before.mesh()
+    task = make_task(settings, None if settings.method == 'auto' else mesh)
     found = plan(task) if settings.method == 'auto' else None
     taken = as_planned(settings, found)
     simulation = TissueSimulation(
-        task.mesh if before is None else before.mesh(),
+        mesh or task.mesh,
         task.material,
         task.resistance,
         model=taken.model,
         stepping=replace(task.stepping, integrator=taken.integrator),
         active=ActiveSettings(**taken.active_region.model_dump()),
         stretch=settings.stretch if before is None else (0.0, 0.0, 0.0),
+        contact=settings.contact,
+        friction=settings.material.dry_friction,
+        gravity=settings.gravity,
     )
-    if before is not None:
+    if before is None:
+        simulation.dynamics.settle()
+    else:
         simulation.resume(before.displacement, before.step)
     return simulation, found
 
 
 def as_planned(settings: TissueSettings, found: Plan | None) -> TissueSettings:
-    """The scene with the method that its simulation takes, given and not to be planned any more.
+    """Return the scene settings with the planned method, and planning switched off.
 
     Args:
         settings: its section `tissue`.
-        found: by the plan, if the scene asks for one.
+        found: the plan, if the scene asks for one.
     """
     method: dict[str, object] = {'method': 'given'}
     if found is not None and found.chosen is not None:
         chosen = found.chosen
         method |= {'model': chosen.model, 'integrator': chosen.integrator}
-        method['active_region'] = ActiveRegion(**asdict(chosen.active))
+        method['active_region'] = ActiveRegionSettings(**asdict(chosen.active))
     return settings.model_copy(update=method)

@@ -1,59 +1,53 @@
-"""What the section `tissue` of a scene file may say."""
+"""Section `tissue` of a scene file."""
 
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from tissue_sim.budget import Budget
-from tissue_sim.elasticity import ModelName
-from tissue_sim.integrators import IntegratorName
-from tissue_sim.scene_file import SceneModel, ScenePath
+from cutting_trainer.node_common.scene_file import SceneModel, ScenePath
+from cutting_trainer.tissue_sim.contact.friction import Friction
+from cutting_trainer.tissue_sim.contact.tool_spring import ContactName
+from cutting_trainer.tissue_sim.elasticity.models import ModelName
+from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+from cutting_trainer.tissue_sim.planner.budget import Budget
+from cutting_trainer.tissue_sim.presets import PRESETS, PresetName
 
 UNIT_SCALE = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
-"""Metres by unit of a mesh file."""
+"""Metres per unit of a mesh file."""
 
 AXES = ('x', 'y', 'z')
 
-PRESETS: dict[str, dict[str, float]] = {
-    'liver_yi2007': {
-        'youngs_modulus': 642.55,
-        'poissons_ratio': 0.47,
-        'density': 1050.0,
-        'toughness': 200.0,
-    },
-    'liver_elastography': {
-        'youngs_modulus': 5400.0,
-        'poissons_ratio': 0.45,
-        'density': 1060.0,
-        'toughness': 200.0,
-    },
-}
-"""Materials by name; see `Material` for their sources."""
+
+def _as_tuple(values: object) -> object:
+    """Return a list as a tuple: below a validator of a mapping, only that is read as one."""
+    return tuple(values) if isinstance(values, list) else values
+
 
 Coordinate = Annotated[float, Field(ge=-2, le=2)]
 Stretch = Annotated[float, Field(ge=-0.3, le=0.3)]
+Acceleration = Annotated[float, Field(ge=-30, le=30)]
+Relaxing = Annotated[float, Field(gt=0, le=0.95)]
+RelaxationTime = Annotated[float, Field(ge=0.005, le=1e4)]
+PronyTerm = Annotated[tuple[Relaxing, RelaxationTime], BeforeValidator(_as_tuple)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
-class Material(SceneModel):
-    """A linear isotropic elastic solid: a preset, single values, or a preset with some replaced.
+class MaterialSettings(SceneModel):
+    """An isotropic elastic solid: a preset, single values, or a preset with some replaced.
 
-    Presets:
-        liver_yi2007: E 642.55 Pa, nu 0.47, 1050 kg/m^3, the liver of J. Yi, MASc thesis, Carleton
-            University 2007, section 7.2.
-        liver_elastography: shear modulus 1.8 kPa of healthy liver by magnetic resonance
-            elastography (PMC6925591, table 1), 1060 kg/m^3; E = 5.4 kPa is three times it. That
-            source has no Poisson's ratio: 0.45 is a compromise, above it linear tetrahedra lock.
-        Both: toughness of porcine liver under a blade, 187 to 225 J/m^2
-            (doi 10.1186/s10033-022-00767-4, table 2).
+    `presets.py` has the named materials and the source of each number.
     """
 
-    preset: Literal['liver_yi2007', 'liver_elastography'] | None = Field(
+    preset: PresetName | None = Field(
         default=None, description='named material that fills in the values not given here'
     )
-    youngs_modulus: float = Field(ge=10, le=1e7, description="Young's modulus [Pa], 10 to 1e7")
+    youngs_modulus: float = Field(
+        ge=10,
+        le=1e7,
+        description="Young's modulus [Pa], 10 to 1e7; with prony that of the first moment",
+    )
     poissons_ratio: float = Field(
         ge=0,
         lt=0.5,
@@ -63,12 +57,54 @@ class Material(SceneModel):
     toughness: float = Field(
         default=200.0, ge=0, le=1e5, description='fracture toughness [J/m^2], 0 to 1e5'
     )
+    stiffening: float = Field(
+        default=0.0,
+        ge=0,
+        le=100,
+        description='b of the law exp(b x) of the model stiffening [-], 0 to 100; 0: neo-Hookean; '
+        'other models do not use it',
+    )
+    prony: Annotated[tuple[PronyTerm, ...], BeforeValidator(_as_tuple)] = Field(
+        default=(),
+        max_length=2,
+        description='viscosity: up to two terms [g, tau], each the share of the shear modulus that '
+        'relaxes, above 0, in sum up to 0.95, and its time [s], 0.005 to 1e4; empty: none',
+    )
     blade_friction: float = Field(
         default=20.0,
         ge=0,
         le=1e4,
         description='friction on the blade by length of edge in the tissue [N/m], 0 to 1e4',
     )
+
+    friction: float = Field(
+        default=0.0,
+        ge=0,
+        le=2,
+        description='dry friction of the tool on the surface: tangential over normal force of a '
+        'tool that slides [-], 0 to 2; 0: none',
+    )
+    static_friction_ratio: float = Field(
+        default=1.0,
+        ge=1,
+        le=3,
+        description='static over sliding friction [-], 1 to 3',
+    )
+
+    @property
+    def dry_friction(self) -> Friction:
+        """The friction of the tool on the surface."""
+        return Friction(self.friction, self.static_friction_ratio)
+
+    @model_validator(mode='after')
+    def _check_prony(self) -> Self:
+        relaxing = sum(share for share, _ in self.prony)
+        if relaxing > 0.95:
+            raise ValueError(
+                f'the terms of prony relax {relaxing:.3g} of the shear modulus; at most 0.95 may '
+                'relax, so that the tissue holds its shape'
+            )
+        return self
 
     @model_validator(mode='before')
     @classmethod
@@ -79,7 +115,7 @@ class Material(SceneModel):
         if preset not in PRESETS:
             known = ', '.join(map(repr, PRESETS))
             raise ValueError(f'preset {preset!r} is not known: there are {known}')
-        return PRESETS[preset] | values
+        return PRESETS[preset].values | values
 
 
 class Damping(SceneModel):
@@ -111,14 +147,14 @@ class Box(SceneModel):
 
 
 class HalfSpace(SceneModel):
-    """Everything at or below a value of one coordinate."""
+    """All points at or below a value of one coordinate."""
 
     axis: Literal['x', 'y', 'z'] = Field(description='coordinate that is compared: x, y or z')
     value: Coordinate = Field(description='its largest value [m], -2 to 2')
 
 
 class FixedRegion(SceneModel):
-    """A box or a half space: nodes whose rest position lies in it do not move."""
+    """A box or half space; nodes with their rest position in it do not move."""
 
     box: Box | None = Field(default=None, description='box with min and max [m]')
     below: HalfSpace | None = Field(default=None, description='half space with axis and value [m]')
@@ -130,7 +166,7 @@ class FixedRegion(SceneModel):
         return self
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which points lie in the region, its boundary included.
+        """Return which points lie in the region, boundary included.
 
         Args:
             points: [m], shape (n, 3).
@@ -146,7 +182,7 @@ class FixedRegion(SceneModel):
 
 
 class Integration(SceneModel):
-    """How a frame is integrated in time."""
+    """Time integration of a frame."""
 
     rate: float = Field(default=30.0, ge=1, le=240, description='frames a second [Hz], 1 to 240')
     safety: float = Field(
@@ -173,8 +209,8 @@ class Integration(SceneModel):
     )
 
 
-class ActiveRegion(SceneModel):
-    """Nodes that nothing moves are not integrated."""
+class ActiveRegionSettings(SceneModel):
+    """Active region: nodes at rest are not integrated."""
 
     mode: Literal['off', 'on', 'budget'] = Field(
         default='off',
@@ -193,23 +229,30 @@ class ActiveRegion(SceneModel):
 
 
 class TissueSettings(SceneModel):
-    """The section `tissue`."""
+    """Section `tissue` of a scene."""
 
     mesh: ScenePath = Field(
         description='file of tetrahedra that meshio reads, relative to the scene file'
     )
     unit: Literal['m', 'cm', 'mm'] = Field(
-        default='m', description='unit of length of the mesh file: m, cm or mm'
+        default='m', description='unit of length of the mesh file'
     )
-    material: Material = Field(description='preset, or youngs_modulus, poissons_ratio and density')
+    material: MaterialSettings = Field(
+        description='preset, or youngs_modulus, poissons_ratio and density'
+    )
     damping: Damping = Field(default=Damping(), description='alpha [1/s] and beta [s]')
     fixed: tuple[FixedRegion, ...] = Field(
         min_length=1, description='regions whose nodes do not move, at least one'
     )
     stretch: tuple[Stretch, Stretch, Stretch] = Field(
         default=(0.0, 0.0, 0.0),
-        description='how far the fixed nodes are pulled apart along x, y, z before the session '
-        '[-], -0.3 to 0.3: the tension under which a cut opens',
+        description='pre-strain of the fixed nodes along x, y, z [-], -0.3 to 0.3: the tension '
+        'under which a cut opens',
+    )
+    gravity: tuple[Acceleration, Acceleration, Acceleration] = Field(
+        default=(0.0, 0.0, 0.0),
+        description='acceleration of gravity along x, y, z [m/s^2], each -30 to 30; the session '
+        'begins at rest under it; 0: none',
     )
     cut_threshold: float = Field(
         default=0.5,
@@ -219,28 +262,36 @@ class TissueSettings(SceneModel):
     )
     method: Literal['given', 'auto'] = Field(
         default='given',
-        description='given: model and integrator of the scene; auto: the least that meet its '
-        'budget, those of the scene where none does',
+        description='given: model and integrator of the scene; auto: the cheapest that meet its '
+        'budget, else those of the scene',
     )
     model: ModelName = Field(
         default='linear_smoothed',
-        description='linear: tensor-mass; linear_smoothed: strains averaged over nodes, against '
-        'locking; corotational: elements turn with the tissue; corotational_smoothed: both',
+        description='linear: tensor-mass; linear_smoothed: nodal smoothing, against locking; '
+        'corotational: elements turn with the tissue; corotational_smoothed: both; '
+        'stiffening: linear_smoothed, and a stiffening law where strain or rotation needs it',
+    )
+    contact: ContactName = Field(
+        default='footprint',
+        description='footprint: loads what the sphere touches, whatever the size of the elements; '
+        'triangle: loads the corners of the touched triangles, as older sessions did',
     )
     integrator: IntegratorName = Field(
         default='symplectic_euler',
         description='euler: forward, needs damping; symplectic_euler: one force a step; rk4: '
-        'fourth-order Runge-Kutta; implicit: backward Euler, any step, damps',
+        'Runge-Kutta; implicit: backward Euler, any step, damps',
     )
-    active_region: ActiveRegion = Field(
-        default=ActiveRegion(), description='which nodes are integrated: mode, nodes, tolerance'
+    active_region: ActiveRegionSettings = Field(
+        default=ActiveRegionSettings(),
+        description='which nodes are integrated: mode, nodes, tolerance',
     )
     integration: Integration = Field(
         default=Integration(), description='rate, safety, substeps and frequency_growth'
     )
 
     budget: Budget = Field(
-        default=Budget(), description='what the method must be able to do, and what it may cost'
+        default=Budget(),
+        description='required range and accuracy of the method, and its allowed cost',
     )
 
     @model_validator(mode='after')
@@ -254,11 +305,12 @@ class TissueSettings(SceneModel):
 
     @property
     def method_taken(self) -> dict[str, str | int | float]:
-        """What the tissue is computed by, by dotted key below `tissue`."""
+        """Method of computation, by dotted key below `tissue`."""
         region = {f'active_region.{k}': v for k, v in self.active_region.model_dump().items()}
-        return {'model': self.model, 'integrator': self.integrator, **region}
+        method = {'model': self.model, 'integrator': self.integrator, 'contact': self.contact}
+        return method | region
 
     @property
     def unit_scale(self) -> float:
-        """Metres by unit of the mesh file."""
+        """Metres per unit of the mesh file."""
         return UNIT_SCALE[self.unit]

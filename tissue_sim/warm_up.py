@@ -1,42 +1,71 @@
-"""Calls every kernel of the tissue once, so that none is compiled or loaded in a session."""
+"""Warm-up: calls the kernels of the tissue once, so that none is compiled or loaded in a session.
 
+A session needs those of one integrator; a plan, which tries all methods, those of all.
+"""
+
+from dataclasses import replace
 from functools import cache
 from itertools import permutations
 
 import numpy as np
 
-from tissue_sim.active_region import ActiveSettings
-from tissue_sim.blade import Resistance
-from tissue_sim.compliance import PointCompliance
-from tissue_sim.contact import State, ToolContact
-from tissue_sim.coupling import Coupling
-from tissue_sim.dynamics import Dynamics, TimeStepping
-from tissue_sim.elasticity import MODELS, ElasticModel
-from tissue_sim.integrators import INTEGRATORS
-from tissue_sim.locate import closest_triangle, distance_to_triangles, locate_points
-from tissue_sim.material import Material
-from tissue_sim.mesh import TetMesh, TopologyDelta
-from tissue_sim.simulation import TissueSimulation
-from tissue_sim.tensor_mass import TensorMass, packed
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact
+from cutting_trainer.tissue_sim.elasticity.compliance import PointCompliance
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel
+from cutting_trainer.tissue_sim.elasticity.tensor_mass import TensorMass, packed
+from cutting_trainer.tissue_sim.mesh.checks import components
+from cutting_trainer.tissue_sim.mesh.locate import (
+    closest_triangle,
+    distance_to_triangles,
+    locate_points,
+)
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 _FRAMES = 40
+_MATERIAL = Material(1000.0, 0.4, 1000.0, 10.0, 5e-4)
+
+
+def warm_up() -> None:
+    """Run every model and integrator; move a tool through a cube, and remove an element."""
+    for integrator in INTEGRATORS:
+        warm_up_method(integrator)
+
+
+def warm_up_method(integrator: IntegratorName) -> None:
+    """Run every model, and one integrator; move a tool through a cube, and remove an element.
+
+    The kernels of all models come first, and in the same order for all integrators: of a kernel
+    inlined in several others, a process runs the copy loaded first, and copies may differ in the
+    last bit. A fixed order makes results reproducible.
+    """
+    warm_up_models()
+    warm_up_frames(integrator)
 
 
 @cache
-def warm_up() -> None:
-    """Every model and integrator; a tool on a cube until the blade is through; an element out.
+def warm_up_frames(integrator: IntegratorName) -> None:
+    """Press a tool on a cube until the blade is through, then take elements out.
 
-    Only the first call does anything.
+    Only the first call for an integrator does anything.
     """
-    _warm_up_models()
     simulation = TissueSimulation(
-        small_cube(), Material(1000.0, 0.4, 1000.0, 10.0, 5e-4), Resistance(0.05, 1.0, 0.1)
+        small_cube(),
+        _MATERIAL,
+        Resistance(0.005, 1.0, 0.1),
+        stepping=TimeStepping(integrator),
     )
     simulation.frame(None)
     for number in range(_FRAMES):
         depth = 2e-4 * number
         simulation.frame(_press(simulation, depth))
-        if simulation.state == State.INSIDE:
+        if simulation.state == ContactState.INSIDE:
             simulation.cut_failed()
     parents = simulation.mesh.tetrahedra[5].astype(np.int64)
     children = np.tile(parents, (4, 1))
@@ -54,6 +83,7 @@ def warm_up() -> None:
     simulation.apply_cut(TopologyDelta(removed_tetrahedra=np.array([0], np.int64)))
     simulation.frame(None)
     mesh, far = simulation.mesh, np.full(3, 1.0)
+    components(mesh.node_count, mesh.triangles[:, :2])
     distance_to_triangles(far, simulation.positions, mesh.triangles)
     closest_triangle(far, mesh.rest, mesh.triangles)
     locate_points(
@@ -67,15 +97,16 @@ def warm_up() -> None:
     )
 
 
-def _warm_up_models() -> None:
-    material = Material(1000.0, 0.4, 1000.0, 10.0, 5e-4)
-    region = ActiveSettings('budget', 6)
+@cache
+def warm_up_models() -> None:
+    """Move a cube with every model. Only the first call does anything."""
+    region, stepping = ActiveSettings('budget', 6), TimeStepping('symplectic_euler')
     for model in MODELS:
-        Dynamics(small_cube(), material, model, active=region).advance(Coupling())
-    for integrator in INTEGRATORS:
-        Dynamics(small_cube(), material, 'linear', TimeStepping(integrator)).advance(Coupling())
-    # What else only a large tissue meets, or one that has been cut for a while.
-    tissue, n = ElasticModel(small_cube(), material, 'linear'), 8
+        Dynamics(small_cube(), _MATERIAL, model, stepping, region).advance(Coupling())
+    viscous = replace(_MATERIAL, prony=((0.5, 1.0),))
+    Dynamics(small_cube(), viscous, 'stiffening', stepping).advance(Coupling())
+    # Further kernels, for a large tissue or one after many cuts.
+    tissue, n = ElasticModel(small_cube(), _MATERIAL, 'linear'), 8
     some, free = np.arange(n - 1), np.ones(3 * n, bool)
     PointCompliance().estimate(tissue, free, some[-1:], np.ones(1), np.eye(3), some)
     rows = TensorMass(tissue.mesh, 1.0, 1.0).tensors
@@ -83,7 +114,7 @@ def _warm_up_models() -> None:
 
 
 def small_cube() -> TetMesh:
-    """A centimetre of tissue in six tetrahedra, fixed at its underside."""
+    """Return a 1 cm cube of tissue of six tetrahedra, fixed at its underside."""
     corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     tets = []
     for order in permutations(range(3)):
@@ -104,7 +135,7 @@ def _press(simulation: TissueSimulation, depth: float) -> ToolContact:
     radius = 0.001
     tip = simulation.positions[nodes].mean(axis=0) + np.array([0.0, 0.0, radius - depth])
     return ToolContact(
-        state=State.TOUCHING,
+        state=ContactState.TOUCHING,
         topology=mesh.topology,
         nodes=nodes,
         weights=np.full(3, 1 / 3),

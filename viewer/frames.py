@@ -1,26 +1,26 @@
-"""The frames that do not move: how the device stands to the tissue."""
+"""Static TF frames: the transform between device and tissue."""
 
 import time
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
-from haptic_bridge.orientation import quaternion
-from haptic_bridge.settings import DeviceSettings
-from tissue_sim.ros import ARM, FRAME, LATCHED, STATIC_FRAMES, stamp
+from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.node_common.orientation import quaternion
+from cutting_trainer.node_common.ros import ARM, FRAME, LATCHED, STATIC_FRAMES, stamp
 
 try:
     from tf2_msgs.msg import TFMessage
-except ModuleNotFoundError:  # it is not among the wheels
+except ModuleNotFoundError:  # it has no wheel
     TFMessage = None
 
 
 DEVICE_FRAME = f'{ARM}_base'
-"""Of the arm's topics, unless its driver has another."""
+"""Frame of the arm's topics, unless its driver has another."""
 
 
 def device_frame(device: DeviceSettings, name: str = DEVICE_FRAME) -> TransformStamped:
-    """From the tissue's frame to the device's; a scale of motion is none that a transform has.
+    """Return the transform from the tissue's frame to the device's; it has no motion scale.
 
     Args:
         device: the scene's section `device`.
@@ -36,7 +36,7 @@ def device_frame(device: DeviceSettings, name: str = DEVICE_FRAME) -> TransformS
 
 
 def publishing_command(frame: TransformStamped) -> str:
-    """What publishes a static frame, to be run where ROS is installed from packages."""
+    """Return the command that publishes a static frame where ROS is installed from packages."""
     to, turn = frame.transform.translation, frame.transform.rotation
     numbers = {'x': to.x, 'y': to.y, 'z': to.z, 'qx': turn.x, 'qy': turn.y, 'qz': turn.z}
     given = ' '.join(f'--{name} {value:.9g}' for name, value in {**numbers, 'qw': turn.w}.items())
@@ -45,17 +45,20 @@ def publishing_command(frame: TransformStamped) -> str:
 
 
 class StaticFrames:
-    """Publishes /tf_static, where its type is installed; else it says what would do so.
+    """Publishes /tf_static where its type is installed; else logs the command that would.
 
     Args:
-        node: that speaks.
+        node: publisher and logger.
         device: the scene's section `device`.
+        publish: whether to publish; false: another node of the graph owns the frames.
     """
 
-    def __init__(self, node: Node, device: DeviceSettings) -> None:
+    def __init__(self, node: Node, device: DeviceSettings, *, publish: bool = True) -> None:
         self._node, self._device = node, device
         self._names = {DEVICE_FRAME}
         self._publisher = None
+        if not publish:
+            return
         if TFMessage is None:
             command = publishing_command(device_frame(device))
             node.get_logger().info(f'/tf_static needs tf2_msgs; instead: {command}')
@@ -64,12 +67,12 @@ class StaticFrames:
         self._publish()
 
     def place(self, device: DeviceSettings) -> None:
-        """Takes another scene's device."""
+        """Publish the device of another scene."""
         self._device = device
         self._publish()
 
-    def learn(self, name: str) -> None:
-        """Takes the frame that a driver gives its poses: it is the device's own too."""
+    def add_frame(self, name: str) -> None:
+        """Add the frame of a driver's poses: it is the device's own too."""
         if name and name != FRAME and name not in self._names:
             self._names = {DEVICE_FRAME, name}
             self._publish()

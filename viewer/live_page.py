@@ -1,34 +1,77 @@
-"""The page of a live session: what is drawn how often, and the handles that move the blade."""
+"""Page of a live session: its content, update rates and allowed requests."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, get_args
 
-from haptic_bridge.settings import ToolSettings
-from tissue_sim.depth import DepthGauge
-from tissue_sim.replica import MeshReplica
-from viewer.history import History
-from viewer.moment import Floats, Moment
-from viewer.panel import PLOTTED, Actions, NodeState, Panel
-from viewer.stage import Stage, TissueView
+import numpy as np
 
-_PLOT_PERIOD, _TABLE_PERIOD = 0.2, 0.5
-_SAMPLES = round(PLOTTED * 30)
-_HANDLES = 0.035
-"""[m] size of the handles at the blade."""
+from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.haptic_bridge.chain import INSIDE
+from cutting_trainer.haptic_bridge.settings import ToolSettings
+from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.viewer import plots
+from cutting_trainer.viewer.controls import LiveControls
+from cutting_trainer.viewer.history import History
+from cutting_trainer.viewer.moment import Moment
+from cutting_trainer.viewer.page_server import PageServer
+from cutting_trainer.viewer.protocol import MAX_NAME, VERSION
+from cutting_trainer.viewer.shapes import (
+    FLOOR,
+    METRES_PER_NEWTON,
+    camera,
+    reach,
+    shown_tissue,
+    tool_shape,
+)
+from cutting_trainer.viewer.surfaces import TissueSource
+
+TITLE = 'Cutting trainer'
+METHODS: tuple[str, ...] = get_args(CuttingSettings.model_fields['method'].annotation)
+SCALE = (0.1, 3.0)
+"""Range of force scales; a present one beyond it widens the range."""
+PLOT_SPAN_S = 15.0
+"""[s] Time span of the plots."""
+_PLOT_PERIOD_S, _TABLE_PERIOD_S = 0.2, 0.5
+_SAMPLES, _EVERY = round(PLOT_SPAN_S * 30), 3
+"""Number of samples kept, and of samples per plotted point."""
+_WARNING_S = 8.0
+_MAX_RATE = 120.0
+"""[%] Top of the plot: a loop that catches up is faster for a moment."""
+_MAX_TEXT = 300
+_FOLDERS = re.compile(r'(?<![\w:/.])(?:/[^/\s:]+)+/(?=[^/\s])')
+TISSUE = 'tissue'
+
+
+class NodeState(NamedTuple):
+    """One line of the table of nodes.
+
+    Attributes:
+        name: of the node.
+        level: of its newest status, 0 to 3 as in diagnostic_msgs/DiagnosticStatus.
+        message: of that status.
+        rate: [Hz] of its loop; 0: it has none.
+    """
+
+    name: str
+    level: int
+    message: str
+    rate: float
 
 
 @dataclass(frozen=True)
 class SessionState:
-    """What the launcher says of the session.
+    """Report of the launcher on the session.
 
     Attributes:
         scene: name.
         method: of cutting.
-        recording: folder of the bag that is being made, '' without one.
-        busy: what it is doing and has to be waited for, '' when nothing.
-        problem: why something could not be done, '' when nothing.
-        scene_file: path, where the nodes read another one from now on; else ''.
+        recording: name of the bag in progress, '' without one.
+        busy: activity that blocks the session, '' when there is none.
+        problem: why a request failed, '' when none did.
+        scene_file: path, where the nodes read another scene from now on; else ''.
     """
 
     scene: str
@@ -40,52 +83,59 @@ class SessionState:
 
 
 class LivePage:
-    """Draws a session on a page, newest state first: what comes in between is never drawn.
+    """Shows a session on its pages, newest state first.
+
+    All methods are called by one thread, that of the graph.
 
     Args:
-        server: of the page.
-        tool: as it is drawn.
-        actions: of the buttons.
-        scenes: to choose from.
-        guide: takes the position [m] and the quaternion w x y z to which the blade is dragged.
-        session: whether there is a launcher behind it.
+        server: of the pages.
+        tool: to draw.
+        controls: allowed requests at the beginning.
     """
 
-    def __init__(
-        self,
-        server: Any,
-        tool: ToolSettings,
-        actions: Actions,
-        scenes: Sequence[str],
-        guide: Callable[[Floats, Floats], None],
-        *,
-        session: bool,
-    ) -> None:
-        self._server = server
-        self.panel = Panel(server, actions, scenes, session=session)
-        self._stage = Stage(server, tool)
-        self._tissue = TissueView(server, '/tissue')
-        self._guide = guide
-        self._handles = server.scene.add_transform_controls(
-            '/handles', scale=_HANDLES, visible=False, depth_test=False, line_width=3.0
-        )
-        self._handles.on_update(self._dragged)
-        self._guided = False
+    def __init__(self, server: PageServer, tool: ToolSettings, controls: LiveControls) -> None:
+        self._server, self._tool, self._controls = server, tool, controls
+        self._source = TissueSource(TISSUE)
         self._history = History(4, _SAMPLES)
-        self._gauge: DepthGauge | None = None
+        self._gauge: SurfaceDepth | None = None
         self._next_plot = self._next_table = 0.0
-        self._said = ('', '')
         self._warning = self._busy = ''
         self._now = self._warned = 0.0
+        self._notices = 0
+        self._hello(None)
+
+    def _hello(self, replica: MeshReplica | None) -> None:
+        positions = None if replica is None else replica.positions()
+        bounds = None if positions is None else reach(positions)
+        self._allow(bounds=bounds)
+        self._server.put(
+            'hello',
+            version=VERSION,
+            mode='live',
+            title=TITLE,
+            session=self._controls.session,
+            scenes=self._controls.scenes,
+            methods=self._controls.methods,
+            duration=None,
+            speeds=[],
+            tool=tool_shape(self._tool),
+            camera=None if positions is None else camera(positions),
+            floor=FLOOR,
+            bounds=None if bounds is None else {'low': bounds.low, 'high': bounds.high},
+            metres_per_newton=METRES_PER_NEWTON,
+            tissues=[shown_tissue(TISSUE, '')],
+            plots_span=PLOT_SPAN_S,
+        )
+
+    def _allow(self, **changes: object) -> None:
+        changed = replace(self._controls, **changes)  # type: ignore[arg-type]
+        if changed != self._controls:
+            self._controls = changed
+            self._server.allow(changed)
 
     def equip(self, tool: ToolSettings) -> None:
-        """Draws another tool, for another tissue."""
-        self._stage.equip(tool)
-        self._gauge = None
-
-    async def _dragged(self, _: Any) -> None:
-        self._guided = True  # from now on the handles show where the hand wants to be
-        self._guide(self._handles.position, self._handles.wxyz)
+        """Replace the drawn tool, for another tissue."""
+        self._tool, self._gauge = tool, None
 
     def show(
         self,
@@ -96,69 +146,123 @@ class LivePage:
         *,
         can_guide: bool,
     ) -> None:
-        """Draws the newest state.
+        """Show the newest state.
 
         Args:
             now: [s], monotonic.
             replica: of the tissue.
             moment: of the tool, None before it is known.
             rates: of force loop and tissue, as shares of their nominal ones.
-            can_guide: whether a hand would follow the handles.
+            can_guide: whether the hand follows goals.
         """
         self._now = now
         if replica.revision >= 0:
             if self._gauge is None:
-                self._measure(replica)
-            self._tissue.show(replica)
+                self._gauge = SurfaceDepth(replica)
+                self._hello(replica)
+            if (frame := self._source.frame(replica)) is not None:
+                self._server.put_tissue(frame)
+        self._allow(can_guide=can_guide)
         depth = force = 0.0
-        if moment is not None:
-            force = float((moment.force @ moment.force) ** 0.5)
-            depth = self._depth(moment)
-            self._stage.show(moment)
-            self._handles.visible = can_guide
-            if not self._guided:
-                self._handles.position, self._handles.wxyz = moment.tip, moment.turn
+        if moment is not None and moment.is_finite:
+            force, depth = float(np.linalg.norm(moment.force)), self._depth(moment)
+            put_moment(self._server, moment, depth, can_guide=can_guide)
         self._history.add(now, force, depth, *rates)
         if now >= self._next_plot:
-            self._next_plot = now + _PLOT_PERIOD
-            self.panel.plots.show(self._history.rows())
-
-    def _measure(self, replica: MeshReplica) -> None:
-        self._gauge = DepthGauge(replica)
-        self._stage.look_at(replica)
+            self._next_plot = now + _PLOT_PERIOD_S
+            self._plot()
 
     def _depth(self, moment: Moment) -> float:
         if self._gauge is None:
             return 0.0
         return float(self._gauge.depths(moment.blade[1:])[0])
 
-    def show_state(self, state: str, text: str) -> None:
-        """Shows the operating state; a warning of late stands beside it."""
-        if self._now - self._warned > 8.0:
+    def _plot(self) -> None:
+        rows = self._history.rows()[::-_EVERY][::-1]
+        times = rows[:, 0] - self._now
+        rates = np.minimum(1e2 * rows[:, 3:], _MAX_RATE).T
+        lines = (
+            plots.FORCE.lines(times, rows[:, 1]),
+            plots.DEPTH.lines(times, 1e3 * rows[:, 2]),
+            plots.RATES.lines(times, *rates),
+        )
+        self._server.put('plots', span=[-PLOT_SPAN_S, 0.0], lines=lines)
+
+    def show_state(self, state: str, text: str, *, e_stopped: bool) -> None:
+        """Show the operating state, with the last warning beside it."""
+        if self._now - self._warned > _WARNING_S:
             self._warning = ''
-        said = (state, self._busy or ' '.join(filter(None, (text, self._warning))))
-        if said != self._said:
-            self._said = said
-            self.panel.show_state(*said)
+        said = self._busy or ' '.join(filter(None, (text, self._warning)))
+        self._allow(e_stopped=e_stopped)
+        self._server.put('state', state=state, text=plain(said), e_stopped=e_stopped)
 
     def warn(self, text: str) -> None:
-        """Shows a warning for a while."""
-        self._warning, self._warned = text, self._now
+        """Show a warning for a while."""
+        self._warning, self._warned = plain(text), self._now
+        self._notices += 1
+        self._server.put('notice', id=self._notices, text=plain(text))
 
     def show_nodes(self, now: float, nodes: Sequence[NodeState]) -> None:
-        """Shows the table of nodes."""
+        """Show the table of nodes at a time [s]."""
         if now >= self._next_table:
-            self._next_table = now + _TABLE_PERIOD
-            self.panel.show_nodes(nodes)
+            self._next_table = now + _TABLE_PERIOD_S
+            rows = [
+                node._replace(message=plain(node.message), rate=round(node.rate, 1))._asdict()
+                for node in nodes
+            ]
+            self._server.put('nodes', rows=rows)
 
     def show_scale(self, scale: float) -> None:
-        """Shows the force scale that holds."""
-        self.panel.show_scale(scale)
+        """Show the present force scale; one beyond the range widens it."""
+        low, high = min(SCALE[0], scale), max(SCALE[1], scale)
+        self._allow(scale=(low, high))
+        self._server.put('scale', value=scale, min=low, max=high)
 
     def show_session(self, state: SessionState) -> None:
-        """Shows what the launcher says."""
-        self._guided &= not state.busy
+        """Show the report of the launcher."""
+        scene, method = state.scene[:MAX_NAME], state.method
         self._busy = state.busy
         if state.problem:
             self.warn(state.problem)
-        self.panel.show_session(state.scene, state.method, state.recording, busy=bool(state.busy))
+        scenes = self._controls.scenes
+        if scene not in scenes:
+            scenes = (*scenes, scene)
+        recording = state.recording.rpartition('/')[2]
+        self._allow(scenes=scenes, busy=state.busy, recording=bool(recording))
+        self._server.put(
+            'session',
+            scene=scene,
+            method=method,
+            recording=recording,
+            busy=plain(state.busy),
+            scenes=scenes,
+        )
+
+
+def put_moment(server: PageServer, moment: Moment, depth: float, *, can_guide: bool) -> None:
+    """Show the pose of the tool and the force on the hand.
+
+    Args:
+        server: of the pages.
+        moment: to show; a moment that is not finite is skipped.
+        depth: of the blade's end [m].
+        can_guide: whether the hand follows goals.
+    """
+    if not moment.is_finite:
+        return
+    server.put(
+        'moment',
+        tip=moment.tip.tolist(),
+        wxyz=moment.orientation.tolist(),
+        proxy=None if moment.contact == INSIDE else moment.proxy.tolist(),
+        force=moment.force.tolist(),
+        depth=depth,
+        can_guide=can_guide,
+        contact=moment.contact,
+    )
+
+
+def plain(text: str) -> str:
+    """Return a text for pages: on one line, bounded in length, file names without folders."""
+    shown = ''.join(c if c.isprintable() else ' ' for c in text[: 4 * _MAX_TEXT])
+    return _FOLDERS.sub('', shown)[:_MAX_TEXT]

@@ -1,6 +1,6 @@
 """The tissue, the tool and the force as `visualization_msgs/MarkerArray`, for RViz and Foxglove.
 
-A message of 20,000 triangles would be 60,000 Python objects: its bytes are written from arrays.
+A message of 20,000 triangles would need 60,000 Python objects: its bytes are written from arrays.
 """
 
 import struct
@@ -10,14 +10,14 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
-from tissue_sim.replica import MeshReplica
-from viewer.moment import Floats, Moment
-from viewer.stage import OPENED, arrow
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.viewer.moment import Floats, Moment
+from cutting_trainer.viewer.shapes import OPENED, arrow
 
 Colouring = Literal['displacement', 'von_mises']
 ARROW, SPHERE, LINE_LIST, TRIANGLE_LIST = 0, 2, 5, 11
 ADD, DELETE = 0, 2
-"""Numbers of `visualization_msgs/Marker`."""
+"""Constants of `visualization_msgs/Marker`."""
 _SHADES = np.asarray(mpl.colormaps['viridis'](np.linspace(0, 1, 256)), np.float32)
 _PLAIN = (1.0, 1.0, 1.0, 1.0)
 _CUT_COLOUR = (*(c / 255 for c in OPENED), 1.0)
@@ -26,7 +26,7 @@ _BLADE_WIDTH, _SHAFT, _HEAD = 0.0012, 0.0016, 0.0044
 
 
 class _Writer:
-    """Little-endian plain CDR, piece by piece."""
+    """Writer of little-endian plain CDR."""
 
     def __init__(self) -> None:
         self._pieces = [b'\x00\x01\x00\x00']
@@ -38,33 +38,33 @@ class _Writer:
         self._at += padding + len(data)
 
     def numbers(self, code: str, *values: float) -> None:
-        """Numbers of one size."""
+        """Write numbers of one size."""
         self._put(struct.pack(f'<{len(values)}{code}', *values), struct.calcsize(code))
 
     def text(self, value: str) -> None:
-        """A string."""
+        """Write a string."""
         data = value.encode() + b'\0'
         self.numbers('I', len(data))
         self._put(data, 1)
 
     def rows(self, values: NDArray[np.generic]) -> None:
-        """A sequence of structures of equal numbers, shape (n, k)."""
+        """Write a sequence of structures of equal numbers, shape (n, k)."""
         self.numbers('I', len(values))
         if len(values):
             self._put(np.ascontiguousarray(values).tobytes(), values.itemsize)
 
     def data(self) -> bytes:
-        """All of it."""
+        """Return all bytes."""
         return b''.join(self._pieces)
 
 
 class Markers:
-    """Writes the messages.
+    """Writes marker messages of tissue and tool.
 
     Args:
-        frame: that the positions are in.
-        colouring: what the colour of the tissue shows.
-        largest: what has the last colour: displacement [m] or stress [Pa]; 0: 10 mm, or a tenth of
+        frame: of the positions.
+        colouring: quantity that colours the tissue.
+        largest: value of the last colour: displacement [m] or stress [Pa]; 0: 10 mm, or a tenth of
             Young's modulus.
         youngs_modulus: [Pa], for stress.
         poissons_ratio: the same.
@@ -86,11 +86,11 @@ class Markers:
     def array(
         self, replica: MeshReplica, moment: Moment | None, radius: float, stamp_ns: int
     ) -> bytes:
-        """The message of a moment, in CDR.
+        """Return the message of a moment, in CDR.
 
         Args:
             replica: of the tissue.
-            moment: of the tool; None: there is none yet.
+            moment: of the tool; None: not known yet.
             radius: of the proxy [m].
             stamp_ns: [ns].
         """
@@ -134,7 +134,7 @@ class Markers:
         colours: NDArray[np.float32] | None = None,
         place: Floats | None = None,
     ) -> None:
-        """One marker; without a place or a point it is taken away from the screen."""
+        """Write one marker; without a place or a point it is removed from the screen."""
         points = np.zeros((0, 3)) if points is None else points
         shown = place is not None or len(points) > 0
         self._header(out, stamp)
@@ -165,14 +165,14 @@ class Markers:
 
 
 def shades(shares: Floats) -> NDArray[np.float32]:
-    """Colours red, green, blue, opacity by share from 0 to 1, shape (n, 4)."""
+    """Return colours red, green, blue, opacity by share from 0 to 1, shape (n, 4)."""
     return _SHADES[(np.clip(shares, 0, 1) * (len(_SHADES) - 1)).astype(int)]
 
 
 def von_mises(replica: MeshReplica, youngs_modulus: float, poissons_ratio: float) -> Floats:
-    """Stress after von Mises by node, the mean of its elements by volume [Pa], shape (n,).
+    """Return the von Mises stress by node, averaged over its elements by volume [Pa], shape (n,).
 
-    By Green's strain and Hooke's law (St. Venant-Kirchhoff), so that a rotation makes no stress.
+    It uses Green's strain and Hooke's law (St. Venant-Kirchhoff), so that a rotation has no stress.
 
     Args:
         replica: of the tissue.

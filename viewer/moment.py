@@ -1,24 +1,24 @@
-"""The tool at one moment, in the tissue frame, from what device and haptic bridge say."""
+"""State of the tool at one moment, in the tissue frame, from the messages of device and bridge."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_bridge.convention import DeviceConvention
-from haptic_bridge.orientation import from_quaternion, quaternion
-from haptic_bridge.settings import DeviceSettings
-from haptic_bridge.wire import ContactCodec, Sample, WrenchStampedCodec
+from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
+from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.node_common.cdr_codec import ContactCodec, StampedMessage, WrenchStampedCodec
+from cutting_trainer.node_common.orientation import from_quaternion, quaternion
 
 Floats = NDArray[np.float64]
 
 
 class Moment(NamedTuple):
-    """Where the tool is, and what it feels.
+    """State of the tool, and the force on the hand.
 
     Attributes:
         tip: [m], shape (3,).
-        turn: of the tool, quaternion w x y z, shape (4,).
+        orientation: quaternion of the tool, w x y z, shape (4,).
         blade: its edge from root to tip [m], shape (2, 3).
         proxy: centre of the proxy sphere [m], shape (3,).
         contact: NONE, TOUCHING or INSIDE.
@@ -26,15 +26,20 @@ class Moment(NamedTuple):
     """
 
     tip: Floats
-    turn: Floats
+    orientation: Floats
     blade: Floats
     proxy: Floats
     contact: int
     force: Floats
 
+    @property
+    def is_finite(self) -> bool:
+        """Return whether every number is finite."""
+        return all(np.isfinite(part).all() for part in self)
+
 
 class Translator:
-    """Makes moments of messages.
+    """Converts messages to moments.
 
     Args:
         device: the scene's section `device`.
@@ -45,12 +50,14 @@ class Translator:
         self._to_tissue = device.tissue_from_device.rotation()
         self._body = device.force_frame == 'body'
 
-    def moment(self, contact: Sample, pose: Sample | None, wrench: Sample | None) -> Moment:
-        """The newest of each message, together.
+    def moment(
+        self, contact: StampedMessage, pose: StampedMessage | None, wrench: StampedMessage | None
+    ) -> Moment:
+        """Combine the newest of each message.
 
         Args:
             contact: `tool/contact`.
-            pose: `arm/measured_cp`; None: not turned.
+            pose: `arm/measured_cp`; None: identity orientation.
             wrench: `arm/servo_cf`; None: no force.
         """
 
@@ -66,7 +73,7 @@ class Translator:
             force = self._to_tissue @ (turned @ felt if self._body else felt)
         return Moment(
             tip=get('device'),
-            turn=np.roll(quaternion(self._to_tissue @ turned), 1),
+            orientation=np.roll(quaternion(self._to_tissue @ turned), 1),
             blade=np.stack([get('blade_root'), get('blade_tip')]),
             proxy=get('proxy'),
             contact=int(get('state')[0]),

@@ -1,4 +1,4 @@
-"""The page of a recorded session: a time line, and a computed tissue beside the recorded one."""
+"""Page of a recorded session: time line, and a computed tissue beside the recorded one."""
 
 import time
 from collections.abc import Callable
@@ -6,22 +6,37 @@ from typing import Any
 
 import numpy as np
 
-from bags.player import Playhead, duration
-from bags.reader import Bag
-from haptic_bridge.settings import DeviceSettings, ToolSettings
-from tissue_sim.depth import DepthGauge
-from viewer.moment import Floats, Translator
-from viewer.page import open_page
-from viewer.panel import TimePlot
-from viewer.stage import OTHER_TISSUE, Stage, TissueView
-from viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
+from cutting_trainer.bags.player import Playhead, duration
+from cutting_trainer.bags.reader import Bag
+from cutting_trainer.haptic_bridge.settings import DeviceSettings, ToolSettings
+from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
+from cutting_trainer.viewer.controls import ReplayControls
+from cutting_trainer.viewer.gate import Gate
+from cutting_trainer.viewer.live_page import put_moment
+from cutting_trainer.viewer.moment import Floats, Translator
+from cutting_trainer.viewer.page_server import PageServer
+from cutting_trainer.viewer.plots import BLUE, DEPTH, FORCE, ORANGE, Plot
+from cutting_trainer.viewer.protocol import VERSION, AnyMessage, Play, Seek, Speed
+from cutting_trainer.viewer.shapes import (
+    FLOOR,
+    METRES_PER_NEWTON,
+    OTHER_TISSUE,
+    TISSUE_SPACING,
+    camera,
+    shown_tissue,
+    tool_shape,
+)
+from cutting_trainer.viewer.surfaces import TissueSource
+from cutting_trainer.viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
+from cutting_trainer.viewer.waiting import Requests
 
-RATE = 30.0
-"""Updates of the page [Hz], at most."""
-_RATES = {'0.1 x': 0.1, '0.25 x': 0.25, '0.5 x': 0.5, '1 x': 1.0, '2 x': 2.0, '4 x': 4.0}
-_PLOTTED = 1000
-"""Points of a plot."""
-_PLOT_PERIOD = 0.2
+RATE_HZ = 30.0
+"""[Hz] Largest update rate of the page."""
+SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+RECORDED, COMPUTED = 'tissue', 'computed'
+"""Names of the tissues on the page."""
+_PLOT_POINTS = 1000
+"""Number of points of a plot."""
 
 
 class ReplayPage:
@@ -30,13 +45,14 @@ class ReplayPage:
     Args:
         bag: to read.
         tool, device: sections of its scene.
-        computed: a tissue to stand beside the recorded one; None: none.
-        name: of that one.
-        host, port: where the page is served.
+        computed: a tissue to show beside the recorded one; None: none.
+        name: of the computed tissue.
+        host, port: address of the page.
+        gate: access rules.
 
     Raises:
         BagError: the bag has no tissue.
-        PageError: the page cannot be served there.
+        PageError: the page cannot be served at this address.
     """
 
     def __init__(
@@ -48,121 +64,140 @@ class ReplayPage:
         name: str,
         host: str,
         port: int,
+        gate: Gate,
     ) -> None:
-        self._recorded, self._tool = RecordedTissue(bag), RecordedTool(bag)
+        self._recorded, self._track = RecordedTissue(bag), RecordedTool(bag)
         self._computed, self._translator = computed, Translator(device)
+        self._sources = TissueSource(RECORDED), TissueSource(COMPUTED)
         self._end = duration(bag)
         self._playhead = Playhead(0.0, self._end)
-        self.server = server = open_page(host, port)
-        self._stage = Stage(server, tool)
         first = self._recorded.go_to(0.0)
-        self._stage.look_at(first, beside=computed is not None)
-        self._tissue = TissueView(server, '/tissue')
-        self._beside: TissueView | None = None
-        if computed is not None:
-            self._put_beside(first.positions(), name)
-        self._depths = DepthGauge(first).depths(self._tool.contact.vectors('blade_tip'))
+        tips = self._track.contact.vectors('blade_tip')
+        self._depths = SurfaceDepth(first).depths(tips)
         self._shown = -1.0
-        self._next_plot = 0.0
-        self._add_controls(name)
+        self._asked = Requests()
+        controls = ReplayControls(self._end, SPEEDS)
+        self.server = PageServer(host, port, gate, 'replay', controls, self._ask)
+        self._hello(first.positions(), tool, name)
+        self._plot(name)
 
-    def _put_beside(self, positions: Floats, name: str) -> None:
-        """A place for the computed tissue, to the right of the recorded one."""
-        width = float(np.ptp(positions[:, 0]))
-        offset = (1.25 * width, 0.0, 0.0)
-        scene = self.server.scene
-        self._beside = TissueView(self.server, '/computed', OTHER_TISSUE, offset)
-        low, middle = positions.min(axis=0), positions.mean(axis=0)
-        for place, text in ((0.0, 'recorded'), (offset[0], name)):
-            spot = (middle[0] + place, low[1] - 0.15 * width, low[2])
-            scene.add_label(f'/label/{text}', text, position=spot)
-
-    def _add_controls(self, name: str) -> None:
-        gui = self.server.gui
-        self._button = gui.add_button('Play')
-        self._slider = gui.add_slider('Time [s]', 0.0, round(self._end, 2), 0.01, 0.0)
-        self._rate = gui.add_dropdown('Speed', tuple(_RATES), initial_value='1 x')
-        self._button.on_click(self._toggle)
-        self._slider.on_update(self._seek)
-        self._rate.on_update(self._change_rate)
-        panel = gui.add_panel()
-        tissue = {'recorded': '#1c7ed6'} | ({name: '#e8590c'} if self._computed else {})
-        self._plots: list[tuple[TimePlot, Floats, list[Floats]]] = []
-        times = np.linspace(0.0, self._end, _PLOTTED)
-        with panel.add_tab('Plots'):
-            for title, lines, values, least in (
-                ('Force on the hand [N]', {'recorded': '#1c7ed6'}, [self._hand()], 0.5),
-                ('Force of the tissue [N]', tissue, self._forces(), 0.5),
-                ('Depth of the blade [mm]', {'recorded': '#c2255c'}, [self._depth()], 5.0),
-            ):
-                plot = TimePlot(gui, title, {**lines, 'now': '#212529'}, least, (0.0, self._end))
-                rows = [_resampled(times, *value) for value in values]
-                self._plots.append((plot, times, rows))
-        panel.dock_left()
-        panel.set_width(320)
-
-    def _hand(self) -> tuple[Floats, Floats]:
-        wrench = self._tool.wrench
-        return wrench.times, np.linalg.norm(wrench.vectors('force'), axis=1)
-
-    def _depth(self) -> tuple[Floats, Floats]:
-        return self._tool.contact.times, 1e3 * self._depths
-
-    def _forces(self) -> list[tuple[Floats, Floats]]:
-        force = self._tool.force
-        rows = [(force.times, np.linalg.norm(force.vectors('force'), axis=1))]
+    def _hello(self, positions: Floats, tool: ToolSettings, name: str) -> None:
+        apart = TISSUE_SPACING * float(np.ptp(positions[:, 0]))
+        tissues = [shown_tissue(RECORDED, 'recorded' if self._computed else '')]
+        seen = [positions]
         if self._computed is not None:
-            rows.append((np.array(self._computed.times), np.array(self._computed.forces)))
-        return rows
+            tissues.append(shown_tissue(COMPUTED, name, OTHER_TISSUE, apart))
+            seen.append(positions + np.array([apart, 0.0, 0.0]))
+        self.server.put(
+            'hello',
+            version=VERSION,
+            mode='replay',
+            title='Recorded session',
+            session=False,
+            scenes=[],
+            methods=[],
+            duration=self._end,
+            speeds=SPEEDS,
+            tool=tool_shape(tool),
+            camera=camera(np.concatenate(seen)),
+            floor=FLOOR,
+            bounds=None,
+            metres_per_newton=METRES_PER_NEWTON,
+            tissues=tissues,
+            plots_span=self._end,
+        )
 
-    async def _toggle(self, _: Any) -> None:
-        if self._playhead.over:
-            self._playhead.seek(0.0)
-        self._playhead.toggle()
+    def _plot(self, name: str) -> None:
+        wrench, force = self._track.wrench, self._track.force
+        times = np.linspace(0.0, self._end, _PLOT_POINTS)
+        hand = np.linalg.norm(wrench.vectors('force'), axis=1)
+        colours = {'recorded': BLUE}
+        felt = [resampled(times, force.times, np.linalg.norm(force.vectors('force'), axis=1))]
+        if self._computed is not None:
+            colours[name] = ORANGE
+            known = np.array(self._computed.times), np.array(self._computed.forces)
+            felt.append(resampled(times, *known))
+        depths = 1e3 * self._depths
+        lines = (
+            FORCE.lines(times, resampled(times, wrench.times, hand)),
+            Plot('Force of the tissue', 'N', colours, 0.5).lines(times, *felt),
+            DEPTH.lines(times, resampled(times, self._track.contact.times, depths)),
+        )
+        self.server.put('plots', span=[0.0, self._end], lines=lines)
 
-    async def _seek(self, event: Any) -> None:
-        if event.client is not None:
-            self._playhead.seek(float(self._slider.value))
+    def _ask(self, message: AnyMessage) -> None:
+        """Queue a request of a page, in the server's thread; the next update executes it."""
+        self._asked.put(message)
+
+    def _do(self, message: AnyMessage) -> None:
+        playhead = self._playhead
+        if isinstance(message, Play):
+            if message.on and playhead.over:
+                playhead.seek(0.0)
+            playhead.paused = not message.on
+        elif isinstance(message, Seek):
+            playhead.seek(message.time)
+        elif isinstance(message, Speed):
+            playhead.rate = message.value
 
     def seek(self, position: float) -> None:
-        """Goes to a position [s], with the time line."""
+        """Go to a position [s]."""
         self._playhead.seek(position)
-        self._slider.value = round(self._playhead.position, 2)
-
-    async def _change_rate(self, _: Any) -> None:
-        self._playhead.rate = _RATES[self._rate.value]
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Serves the page until `stop` says so."""
+        """Serve the page until `stop` returns True."""
         while not stop():
             began = time.monotonic()
-            self.show(self._playhead.move(began), began)
-            time.sleep(max(0.0, began + 1 / RATE - time.monotonic()))
+            self.update(began)
+            time.sleep(max(0.0, began + 1 / RATE_HZ - time.monotonic()))
 
-    def show(self, position: float, now: float) -> None:
-        """Shows the session at a position [s], at a time of the caller's clock [s]."""
-        if self._playhead.over and not self._playhead.paused:
-            self._playhead.toggle()
-        self._button.label = 'Play' if self._playhead.paused else 'Pause'
+    def update(self, now: float) -> None:
+        """Execute the requests of pages, and show the session at a time of the clock [s]."""
+        self.server.tick()
+        for message in self._asked.taken():
+            self._do(message)
+        self.show(self._playhead.move(now))
+
+    def show(self, position: float) -> None:
+        """Show the session at a position [s]."""
+        playhead = self._playhead
+        if playhead.over and not playhead.paused:
+            playhead.toggle()
         if position != self._shown:
             self._shown = position
-            self._tissue.show(self._recorded.go_to(position))
-            if self._beside is not None and self._computed is not None:
-                self._beside.show(self._computed.go_to(position))
-            contact = self._tool.contact.at(position)
+            self._show_tissues(position)
+            contact = self._track.contact.at(position)
             if contact is not None:
-                pose, wrench = self._tool.pose.at(position), self._tool.wrench.at(position)
-                self._stage.show(self._translator.moment(contact, pose, wrench))
-            if not self._playhead.paused:
-                self._slider.value = round(position, 2)
-        if now >= self._next_plot:
-            self._next_plot = now + _PLOT_PERIOD
-            for plot, times, rows in self._plots:
-                reached = np.where(np.abs(times - position) <= self._end / _PLOTTED / 2, 1e9, 0.0)
-                plot.show(times, *rows, mark=reached)
+                pose, wrench = self._track.pose.at(position), self._track.wrench.at(position)
+                moment = self._translator.moment(contact, pose, wrench)
+                put_moment(self.server, moment, self._depth(position), can_guide=False)
+        self.server.put(
+            'playhead',
+            time=round(position, 3),
+            playing=not playhead.paused,
+            speed=playhead.rate,
+        )
+
+    def _show_tissues(self, position: float) -> None:
+        tissues: list[Any] = [self._recorded.go_to(position)]
+        if self._computed is not None:
+            tissues.append(self._computed.go_to(position))
+        for source, tissue in zip(self._sources, tissues, strict=False):
+            if (frame := source.frame(tissue)) is not None:
+                self.server.put_tissue(frame)
+
+    def _depth(self, position: float) -> float:
+        at = int(np.searchsorted(self._track.contact.times, position, 'right')) - 1
+        return float(self._depths[max(at, 0)])
 
 
-def _resampled(times: Floats, known: Floats, values: Floats) -> Floats:
-    """Values at other times: the last one before each, and 0 before the first."""
+def resampled(times: Floats, known: Floats, values: Floats) -> Floats:
+    """Return values at other times: the last one before each, and 0 before the first.
+
+    Args:
+        times: requested times [s], shape (n,).
+        known: times of the values [s], ascending, shape (k,).
+        values: shape (k,).
+    """
     at = np.searchsorted(known, times, 'right') - 1
     return np.where(at >= 0, values[np.maximum(at, 0)], 0.0) if len(known) else 0.0 * times

@@ -1,4 +1,4 @@
-"""A recorded session by its time: the tissue and the tool at any moment, forwards and back."""
+"""Random access by time to a recorded session: tissue and tool at any moment."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,24 +6,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.errors import BagError
-from bags.player import first_time
-from bags.reader import Bag, Recorded
-from bags.tissue import follow
-from bags.topics import CONTACT, FORCE, MESH, POSE, SERVO_CF, UPDATES, of_session
-from haptic_bridge.wire import (
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.player import first_time
+from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.tissue import follow
+from cutting_trainer.bags.topics import CONTACT, FORCE, MESH, POSE, SERVO_CF, UPDATES, of_session
+from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
-    Sample,
     StampedCodec,
+    StampedMessage,
     WrenchStampedCodec,
 )
-from tissue_sim.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
 Floats = NDArray[np.float64]
-_SPACING = 0.005
-"""[s] between two samples of a fast topic that are kept."""
+_SAMPLE_SPACING_S = 0.005
+"""[s] Shortest time between two kept samples of a fast topic."""
 
 
 class RecordedTissue:
@@ -50,7 +50,7 @@ class RecordedTissue:
         self._next = 0
 
     def go_to(self, seconds: float) -> MeshReplica:
-        """The tissue at a time [s]; before the first keyframe, that one."""
+        """Return the tissue at a time [s]; before the first keyframe, that one."""
         first = int(self._keyframes[0])
         until = max(int(np.searchsorted(self._times, seconds, 'right')), first + 1)
         keyframe = int(self._keyframes[np.searchsorted(self._keyframes, until) - 1])
@@ -63,7 +63,7 @@ class RecordedTissue:
 
 
 @dataclass(eq=False)
-class Still:
+class TissueSnapshot:
     """One moment of a computed tissue, with the fields of a replica that are drawn.
 
     Attributes:
@@ -92,11 +92,11 @@ class ComputedTissue:
     """
 
     times: list[float] = field(default_factory=list)
-    stills: list[Still] = field(default_factory=list)
+    stills: list[TissueSnapshot] = field(default_factory=list)
     forces: list[float] = field(default_factory=list)
 
     def add(self, seconds: float, simulation: Any, force: float) -> None:
-        """Takes what a simulation has come to at a time [s], and its force [N]."""
+        """Store the state of a simulation at a time [s], and its force [N]."""
         mesh, last = simulation.mesh, self.stills[-1] if self.stills else None
         if last is not None and last.topology == mesh.topology:
             shared = last.rest, last.triangles, last.triangle_kind
@@ -105,12 +105,12 @@ class ComputedTissue:
         rest, triangles, kinds = shared
         moved = simulation.displacement.astype(np.float32)
         number = len(self.stills)
-        self.stills.append(Still(rest, moved, triangles, kinds, mesh.topology, number))
+        self.stills.append(TissueSnapshot(rest, moved, triangles, kinds, mesh.topology, number))
         self.times.append(seconds)
         self.forces.append(force)
 
-    def go_to(self, seconds: float) -> Still:
-        """The tissue at a time [s]; before the first frame, that one."""
+    def go_to(self, seconds: float) -> TissueSnapshot:
+        """Return the tissue at a time [s]; before the first frame, that one."""
         return self.stills[max(int(np.searchsorted(self.times, seconds, 'right')) - 1, 0)]
 
 
@@ -120,7 +120,7 @@ class Samples:
     Args:
         bag: to read.
         topic: name; without messages everything is empty.
-        codec: that reads them.
+        codec: decodes them.
     """
 
     def __init__(self, bag: Bag, topic: str, codec: StampedCodec) -> None:
@@ -130,19 +130,19 @@ class Samples:
         times = []
         for message in bag.messages([topic]):
             seconds = (message.log_time - origin) * 1e-9
-            if seconds >= due and codec.decode(message.data).stamp_ns:  # else of no device yet
-                due = seconds + _SPACING
+            if seconds >= due and codec.decode(message.data).stamp_ns:  # 0: there is no device yet
+                due = seconds + _SAMPLE_SPACING_S
                 self._data.append(message.data)
                 times.append(seconds)
         self.times = np.array(times)
 
-    def at(self, seconds: float) -> Sample | None:
-        """The newest message at a time [s]; None before the first."""
+    def at(self, seconds: float) -> StampedMessage | None:
+        """Return the newest message at a time [s]; None before the first."""
         at = int(np.searchsorted(self.times, seconds, 'right')) - 1
         return self._codec.decode(self._data[at]) if at >= 0 else None
 
     def vectors(self, name: str) -> Floats:
-        """A vector of each message, shape (n, 3)."""
+        """Return a vector of each message, shape (n, 3)."""
         place = self._codec.fields[name]
         return np.reshape([self._codec.decode(d).values[place] for d in self._data], (-1, 3))
 

@@ -1,0 +1,86 @@
+"""Whether the methods of the shipped scenes lie on the front of the chart."""
+
+import csv
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from bench.accuracy.measure import EQUAL_ERROR_RATIO, Point
+from cutting_trainer.session.scene import SCENES, load_scene
+from cutting_trainer.tissue_sim.settings import TissueSettings
+
+PANELS = {
+    'block': ('indentation', 'after_cut'),
+    'flap': ('large_rotation',),
+    'liver': ('indentation', 'after_cut'),
+    'palpation': ('indentation',),
+}
+"""Problems of the chart that resemble a scene."""
+
+
+def read_points(path: Path) -> list[Point]:
+    """Return points that `trainer chart` has written."""
+    kinds = {field.name: field.type for field in fields(Point)}
+    with path.open(newline='', encoding='utf-8') as table:
+        return [
+            Point(**{name: _value(kinds[name], text) for name, text in row.items()})
+            for row in csv.DictReader(table)
+        ]
+
+
+def _value(kind: object, text: str) -> Any:
+    if kind is bool:
+        return text == 'True'
+    if kind is int:
+        return int(text)
+    return float(text) if kind is float else text
+
+
+def reasons_off_front(points: list[Point], problem: str, method: tuple[str, str]) -> list[str]:
+    """Return the reasons why a method is not on the front of a problem; none: it is.
+
+    No method may beat it on any mesh, and one of its meshes must be on the front of all.
+
+    Args:
+        points: of the chart.
+        problem: name of the panel.
+        method: model and integrator.
+    """
+    panel = [p for p in points if p.problem == problem]
+    own = [p for p in panel if (p.model, p.integrator) == method]
+    if not own:
+        return ['it has not been measured there']
+    found = [
+        f'{other.model} by {other.integrator} is faster and as near with {p.tetrahedra} tetrahedra'
+        for p in own
+        for other in panel
+        if other.resolution == p.resolution
+        and other.cpu_per_second < p.cpu_per_second
+        and other.displacement_error < EQUAL_ERROR_RATIO * p.displacement_error
+    ]
+    if not any(p.front for p in own):
+        found.append('on each mesh another method on another mesh is faster and as near')
+    return found
+
+
+def scenes() -> dict[str, TissueSettings]:
+    """Return the tissue settings of the shipped scenes."""
+    return {path.stem: load_scene(path.stem).tissue for path in sorted(SCENES.glob('*.yaml'))}
+
+
+def standing(points: list[Point], scene: str, tissue: TissueSettings) -> dict[str, list[str]]:
+    """Return the reasons why the method of a scene is not on the front, by panel; none: it is."""
+    method = (tissue.model, tissue.integrator)
+    return {problem: reasons_off_front(points, problem, method) for problem in PANELS[scene]}
+
+
+def front_table(points: list[Point]) -> str:
+    """Return each shipped scene, its method, and where it stands, as a table of the page."""
+    rows = ['| scene | method | panel | on the front |', '|---|---|---|---|']
+    for scene, tissue in scenes().items():
+        for problem, why in standing(points, scene, tissue).items():
+            rows.append(
+                f'| {scene} | {tissue.model} by {tissue.integrator} | '
+                f'[{problem}](charts/{problem}.png) | {"; ".join(why) or "yes"} |'
+            )
+    return '\n'.join(rows)

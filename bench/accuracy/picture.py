@@ -1,0 +1,169 @@
+"""One panel of the chart as a picture."""
+
+import textwrap
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from bench.accuracy.measure import Point
+
+_COLOURS = {
+    'linear': '#4477aa',
+    'linear_smoothed': '#66ccee',
+    'corotational': '#cc6677',
+    'corotational_smoothed': '#882255',
+}
+_REGIONS = {'off': 'o', 'on': '^', 'budget': 's'}
+_JOINED = 'front: nothing is\ncheaper and nearer'
+_MARKERS = {'euler': 'v', 'symplectic_euler': 'o', 'rk4': 's', 'implicit': 'D'}
+
+
+def draw(
+    title: str,
+    reference: str,
+    points: list[Point],
+    sentence: str,
+    thesis: tuple[str, str],
+    default: tuple[str, str],
+) -> Figure:
+    """Return error against CPU time, both logarithmic.
+
+    Args:
+        title: of the problem.
+        reference: name of the reference.
+        points: of the problem.
+        sentence: caption.
+        thesis, default: model and integrator that are marked.
+    """
+    figure, axes = _panel(title, reference, sentence)
+    _join(axes, points)
+    for model, colour in _COLOURS.items():
+        for integrator, marker in _MARKERS.items():
+            own = [p for p in points if (p.model, p.integrator) == (model, integrator)]
+            own.sort(key=lambda p: (p.resolution, p.cpu_per_second))
+            axes.plot(
+                [p.cpu_per_second for p in own],
+                [100 * p.displacement_error for p in own],
+                marker=marker,
+                color=colour,
+                lw=0.7,
+                ms=6,
+                alpha=0.85,
+                ls='-' if integrator != 'implicit' else ':',
+            )
+    _mark(axes, points, thesis, 'black', 210)
+    _mark(axes, points, default, '#ddaa33', 330)
+    axes.legend(handles=_legend(thesis, default), fontsize=8, loc='upper left',
+                bbox_to_anchor=(1.01, 1.0))  # fmt: skip
+    return figure
+
+
+def draw_regions(
+    title: str, reference: str, points: list[Point], sentence: str, default: str
+) -> Figure:
+    """Return the same for active regions: a line and a front by mesh, a symbol by region.
+
+    Args:
+        title, reference, points, sentence: as for `draw`.
+        default: region that is marked.
+    """
+    figure, axes = _panel(title, reference, sentence)
+    entries = []
+    for resolution, colour in zip(
+        sorted({p.resolution for p in points}), _COLOURS.values(), strict=False
+    ):
+        mesh = [p for p in points if p.resolution == resolution]
+        _join(axes, mesh)
+        for kind, marker in _REGIONS.items():
+            own = [p for p in mesh if p.region.split()[0] == kind]
+            own.sort(key=lambda p: p.displacement_error)
+            axes.plot(
+                [p.cpu_per_second for p in own],
+                [100 * p.displacement_error for p in own],
+                marker=marker, color=colour, lw=0.7, ms=7, alpha=0.85,
+            )  # fmt: skip
+            for p in own:
+                axes.annotate(
+                    p.region, (p.cpu_per_second, 100 * p.displacement_error), fontsize=7,
+                    xytext=(6, 2), textcoords='offset points', color='0.3',
+                )  # fmt: skip
+        label = f'{mesh[0].tetrahedra} tetrahedra'
+        entries.append(Line2D([], [], color=colour, lw=3, label=label))
+    _ring(axes, [p for p in points if p.region == default], '#ddaa33', 330)
+    entries += [
+        Line2D([], [], color='0.3', marker=m, lw=0, label=text)
+        for m, text in zip(
+            _REGIONS.values(),
+            ('off: all nodes', 'on: tolerance [m/s]', 'budget: nodes'),
+            strict=True,
+        )
+    ]
+    ring = Line2D([], [], color='#ddaa33', marker='o', lw=0, ms=12, mfc='none', mew=1.8)
+    ring.set_label(f'default: {default}')
+    joined = Line2D([], [], color='0.75', lw=5, label=_JOINED)
+    axes.legend(handles=[*entries, ring, joined], fontsize=8, loc='upper left',
+                bbox_to_anchor=(1.01, 1.0))  # fmt: skip
+    return figure
+
+
+def _join(axes: Any, points: list[Point]) -> None:
+    """Draw a line through the points on the front, behind everything."""
+    front = sorted((p for p in points if p.front), key=lambda p: p.cpu_per_second)
+    axes.plot(
+        [p.cpu_per_second for p in front],
+        [100 * p.displacement_error for p in front],
+        color='0.75',
+        lw=5,
+        zorder=0,
+        solid_capstyle='round',
+    )
+
+
+def _panel(title: str, reference: str, sentence: str) -> tuple[Figure, Any]:
+    """Return axes, and the sentence under them."""
+    figure = Figure(figsize=(9.0, 6.4), layout='constrained')
+    axes = figure.subplots()
+    axes.axvline(1.0, color='0.4', lw=0.8, ls='--')
+    axes.annotate(
+        'real time on one core', (1.0, 0.02), xycoords=('data', 'axes fraction'), rotation=90,
+        ha='right', va='bottom', fontsize=8, color='0.3',
+    )  # fmt: skip
+    axes.set(xscale='log', yscale='log', title=title)
+    axes.set_xlabel('CPU time for one second of simulated time [s/s]')
+    axes.set_ylabel(f'error of the displacement [%]\nagainst {reference}', fontsize=9)
+    axes.grid(which='both', lw=0.3, alpha=0.5)
+    figure.supxlabel('\n'.join(textwrap.wrap(sentence, 118)), fontsize=9, x=0.02, ha='left')
+    return figure, axes
+
+
+def _mark(
+    axes: Any, points: list[Point], method: tuple[str, str], colour: str, size: float
+) -> None:
+    _ring(axes, [p for p in points if (p.model, p.integrator) == method], colour, size)
+
+
+def _ring(axes: Any, own: list[Point], colour: str, size: float) -> None:
+    axes.scatter(
+        [p.cpu_per_second for p in own],
+        [100 * p.displacement_error for p in own],
+        s=size,
+        facecolors='none',
+        edgecolors=colour,
+        linewidths=1.8,
+        zorder=3,
+    )
+
+
+def _legend(thesis: tuple[str, str], default: tuple[str, str]) -> list[Line2D]:
+    entries = [Line2D([], [], color=c, lw=3, label=name) for name, c in _COLOURS.items()]
+    entries += [
+        Line2D([], [], color='0.3', marker=m, lw=0, label=name) for name, m in _MARKERS.items()
+    ]
+    for colour, name, method in (('black', 'thesis', thesis), ('#ddaa33', 'default', default)):
+        label = f'{name}: {method[0]}\nby {method[1]}'
+        ring = Line2D([], [], color=colour, marker='o', lw=0, ms=12, mfc='none', mew=1.8)
+        ring.set_label(label)
+        entries.append(ring)
+    entries.append(Line2D([], [], color='0.75', lw=5, label=_JOINED))
+    return entries

@@ -1,0 +1,291 @@
+"""Commands that measure and torture the trainer: `./trainer bench COMMAND`, in a checkout only."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from bench.speed.parts import Part
+from cutting_trainer.cli.options import (
+    EXIT_STATUSES,
+    AsJson,
+    Domain,
+    SceneArgument,
+    SceneOption,
+    Seed,
+)
+from cutting_trainer.session.domain import parse_domain
+from cutting_trainer.session.status import Status
+
+app = typer.Typer(
+    name='bench',
+    help='Measure what the trainer costs and what it is worth; try to break it.',
+    epilog=EXIT_STATUSES,
+    add_completion=False,
+    invoke_without_command=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode='markdown',
+)
+
+
+@app.callback()
+def _bench(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command(epilog=EXIT_STATUSES)
+def speed(
+    names: Annotated[
+        list[Part] | None,
+        typer.Argument(help='Which benchmarks; all unless some are named.'),
+    ] = None,
+    size: Annotated[
+        list[int] | None,
+        typer.Option(min=6, max=1_000_000, help='Tetrahedra, about; may be given again.'),
+    ] = None,
+    as_json: AsJson = False,
+    save: Annotated[
+        bool, typer.Option('--save', help='Keep the figures in bench/results.')
+    ] = False,
+    against: Annotated[
+        Path | None, typer.Option(help='File of an earlier run: its figures stand beside.')
+    ] = None,
+) -> None:
+    """Measure what force, step, frame, cut, proxy, messages, session and start cost here."""
+    from bench.speed.command import run_bench
+
+    run_bench(names or [], size or [], as_json=as_json, save=save, against=against)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def scaling(
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='Folder; charts/ in it takes the picture.')
+    ] = Path('docs'),
+    size: Annotated[
+        list[int] | None,
+        typer.Option(min=6, max=1_000_000, help='Tetrahedra, about; given twice at least.'),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure how costs grow with the mesh, from 1,000 to 500,000 tetrahedra: a picture."""
+    from bench.speed.scaling import run_scaling
+
+    run_scaling(output, size or [], as_json=as_json)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def strokes(
+    strokes: Annotated[int, typer.Option(min=1, help='How many.')] = 1000,
+    every: Annotated[int, typer.Option(min=1, help='Look after every so many.')] = 50,
+    size: Annotated[
+        int, typer.Option(min=600, max=1_000_000, help='Tetrahedra at the beginning, about.')
+    ] = 10_000,
+    seed: Seed = 0,
+    growth: Annotated[
+        float, typer.Option(min=1, max=1000, help='tissue.integration.frequency_growth.')
+    ] = 1.1,
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='Folder; charts/ in it takes the picture.')
+    ] = Path('docs'),
+    as_json: AsJson = False,
+) -> None:
+    """Measure time and memory of a session of very many strokes, its mesh checked on the way."""
+    from bench.speed.strokes import run_strokes
+
+    options = (output, strokes, every, size, seed, growth)
+    raise typer.Exit(int(run_strokes(*options, as_json=as_json)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def timing(
+    scene: SceneOption = 'liver',
+    seconds: Annotated[float, typer.Option(min=5.0, max=3600.0, help='Duration [s].')] = 20.0,
+    domain: Domain = '',
+    as_json: AsJson = False,
+) -> None:
+    """Measure wake-up and pose-to-force latency of a session, beside cyclictest."""
+    from bench.speed.timing import run_bench
+
+    raise typer.Exit(int(run_bench(scene, seconds, parse_domain(domain), as_json=as_json)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def chart(
+    output: Annotated[
+        Path,
+        typer.Option('--output', '-o', help='Folder for the page; charts/ in it for the rest.'),
+    ] = Path('docs'),
+    as_json: AsJson = False,
+) -> None:
+    """Measure every method on this machine: error against CPU time, pictures and CSV."""
+    from bench.accuracy.chart import run_chart
+
+    run_chart(output, as_json=as_json)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def validate(
+    cases: Annotated[
+        list[str] | None, typer.Argument(help='Which cases, by name; all unless some are named.')
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option('--quick', help='Only the coarsest mesh of each case.')
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='Folder for the page; charts/ in it for the picture.'),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compute published experiments by every elastic model; print errors and verdicts."""
+    from bench.validate.command import run_validate
+
+    run_validate(cases or [], quick=quick, folder=output, as_json=as_json)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def stability(
+    scene: SceneArgument,
+    as_json: AsJson = False,
+) -> None:
+    """Print each integrator's largest stable step on a scene's mesh: by theory, and measured."""
+    from bench.accuracy.stability import run_stability
+
+    run_stability(scene, as_json=as_json)
+
+
+@app.command(epilog=EXIT_STATUSES)
+def cuts(
+    output: Annotated[
+        Path,
+        typer.Option('--output', '-o', help='Folder for the page, the table and the pictures.'),
+    ] = Path('docs'),
+    as_json: AsJson = False,
+) -> None:
+    """Cut the same strokes by every method and compare what they leave."""
+    from bench.cuts.cases_picture import write_cases
+    from bench.cuts.compare import run_comparison
+
+    run_comparison(output, as_json=as_json)
+    write_cases(output)
+
+
+@app.command('haptics-accuracy', epilog=EXIT_STATUSES)
+def haptics_accuracy(
+    output: Annotated[
+        Path,
+        typer.Option('--output', '-o', help='Folder with haptics.md, for tables and picture.'),
+    ] = Path('docs'),
+    as_json: AsJson = False,
+) -> None:
+    """Measure the force between frames against a tissue that runs at 1 kHz."""
+    from bench.haptics.pages import run_accuracy
+
+    _leave_with(run_accuracy(output, as_json=as_json))
+
+
+@app.command('haptics-stability', epilog=EXIT_STATUSES)
+def haptics_stability(
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='Folder with haptics.md, for table and picture.')
+    ] = Path('docs'),
+    as_json: AsJson = False,
+) -> None:
+    """Map where the tool can be held still, by hand, tissue, delay and loss."""
+    from bench.haptics.pages import run_stability
+
+    _leave_with(run_stability(output, as_json=as_json))
+
+
+@app.command('fuzz-cuts', epilog=EXIT_STATUSES)
+def fuzz_cuts(
+    strokes: Annotated[int, typer.Option(min=1, help='How many random strokes.')] = 10000,
+    seed: Annotated[int, typer.Option(help='Seed of everything random.')] = 0,
+    method: Annotated[str, typer.Option(help='Method of cutting.')] = 'combined',
+    output: Annotated[
+        Path, typer.Option(help='Folder for scenes that break an invariant.')
+    ] = Path(),
+    replay: Annotated[Path | None, typer.Option(help='Cut a saved scene again instead.')] = None,
+) -> None:
+    """Cut random meshes by random strokes and check every invariant after every batch."""
+    from bench.cuts.fuzz_cuts import replay_scene, run_strokes
+
+    options = (strokes, seed, method, output)
+    raise typer.Exit(int(replay_scene(replay, method) if replay else run_strokes(*options)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def chaos(
+    scene: SceneOption = 'block',
+    minutes: Annotated[float, typer.Option(min=1.0, max=1440.0, help='Duration [min].')] = 10.0,
+    faults: Annotated[int, typer.Option(min=1, help='How many nodes are struck.')] = 50,
+    bag: Annotated[
+        Path | None,
+        typer.Option(help='New folder for the bag (default: bags/sessions/chaos-SCENE-TIME).'),
+    ] = None,
+    seed: Seed = 0,
+    domain: Domain = 'free',
+    as_json: AsJson = False,
+) -> None:
+    """Kill and freeze nodes of a session at random: is the hand safe, does all come back?"""
+    from bench.trials.chaos import ChaosOptions, run_chaos
+
+    options = ChaosOptions(scene, minutes, faults, seed, bag, parse_domain(domain), as_json)
+    raise typer.Exit(int(run_chaos(options)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def fuzz(
+    scene: SceneOption = 'block',
+    messages: Annotated[
+        int, typer.Option(min=1, help='How many malformed messages are sent.')
+    ] = 1_000_000,
+    flood: Annotated[
+        float,
+        typer.Option(min=0.0, max=60.0, help='10 kHz afterwards on each topic of 1 kHz [s].'),
+    ] = 2.0,
+    largest: Annotated[
+        float,
+        typer.Option(min=5.0, max=1000.0, help='Size of one huge message to each topic [MB].'),
+    ] = 100.0,
+    bag: Annotated[
+        Path | None,
+        typer.Option(help='New folder for the bag (default: bags/sessions/fuzz-SCENE-TIME).'),
+    ] = None,
+    seed: Seed = 0,
+    domain: Domain = 'free',
+    as_json: AsJson = False,
+) -> None:
+    """Send a session what nobody should send: does any node die, or pass it on?"""
+    from bench.trials.fuzz import FuzzOptions, run_fuzz
+
+    options = FuzzOptions(scene, messages, flood, largest, seed, bag, parse_domain(domain), as_json)
+    raise typer.Exit(int(run_fuzz(options)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def soak(
+    scene: SceneOption = 'block',
+    minutes: Annotated[float, typer.Option(min=1.0, max=10080.0, help='Duration [min].')] = 60.0,
+    every: Annotated[float, typer.Option(min=20.0, help='Length of a session [s].')] = 60.0,
+    seed: Seed = 0,
+    domain: Domain = 'free',
+    as_json: AsJson = False,
+) -> None:
+    """Run session after session on the same processes: do memory, threads or handles grow?"""
+    from bench.trials.soak import SoakOptions, run_soak
+
+    options = SoakOptions(scene, minutes, every, seed, parse_domain(domain), as_json)
+    raise typer.Exit(int(run_soak(options)))
+
+
+def _leave_with(failures: list[str]) -> None:
+    """Print what has failed and leave with the status for it."""
+    console = Console(stderr=True, soft_wrap=True)
+    for failure in failures:
+        console.print(f'[bold red]no:[/] {escape(failure)}', highlight=False)
+    raise typer.Exit(int(Status.FAILED if failures else Status.OK))

@@ -1,0 +1,134 @@
+"""Measure the figures of a subject: `./trainer run python -m bench.figures SUBJECT [--json]`."""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from functools import partial
+from multiprocessing import get_context
+from typing import NamedTuple
+
+from bench.figures.figure import Figure, figures_of
+
+
+class Subject(NamedTuple):
+    """Modules that measure a subject.
+
+    Attributes:
+        modules: in this folder, each with `measure() -> list[Figure]`; one after the other.
+        not_covered: reason why a claim has no figure here, by its number.
+        together: modules that measure no time; at the same time, in processes of their own.
+    """
+
+    modules: tuple[str, ...]
+    not_covered: dict[int, str]
+    together: tuple[str, ...] = ()
+
+
+SUBJECTS = {
+    'blade': Subject(
+        modules=('blade_severance',),
+        not_covered={
+            3: 'the law of the blade is not measured here',
+            4: 'the force in the hand is not measured here',
+            5: 'it needs a live session under load',
+            6: 'the lips are not measured here',
+            7: 'it takes minutes: `./trainer validate`',
+            8: 'the pieces are not measured here',
+            9: 'it takes a quiet machine: `./trainer bench speed`',
+        },
+    ),
+    'house': Subject(
+        modules=('house',),
+        not_covered={
+            1: 'it needs readers who have not seen the code',
+            4: 'starting from empty caches takes minutes, and so does `./trainer test`',
+        },
+    ),
+    'tissue': Subject(
+        modules=('tissue_contact', 'tissue_friction', 'tissue_law', 'tissue_relaxation'),
+        not_covered={
+            4: 'the blade in tissue that stiffens is not measured here',
+            7: 'it takes minutes: `./trainer validate`',
+        },
+    ),
+    'trust': Subject(
+        modules=('trust_bridge', 'trust_output'),
+        together=('trust_page', 'trust_files'),
+        not_covered={7: 'it needs a browser: `./trainer test --all -k test_page_session`'},
+    ),
+}
+
+
+def main() -> int:
+    """Measure, print, and return 1 where a figure falls short of its bound."""
+    parser = argparse.ArgumentParser(prog='bench.figures', description=__doc__)
+    parser.add_argument('subject', choices=sorted(SUBJECTS))
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    options = parser.parse_args()
+    subject = SUBJECTS[options.subject]
+    began = time.monotonic()
+    figures: list[Figure] = []
+    errors: dict[str, str] = {}
+    for name, measured in _measure(subject):
+        try:
+            figures += measured()
+        except Exception as error:  # one that cannot be measured falls short; the rest go on
+            errors[name] = f'{type(error).__name__}: {error}'
+    seconds = time.monotonic() - began
+    if options.json:
+        print(as_json(options.subject, subject, figures, errors, seconds))
+    else:
+        print_table(subject, figures, errors, seconds)
+    return 0 if figures and not errors and all(figure.passes for figure in figures) else 1
+
+
+def _measure(subject: Subject) -> Iterator[tuple[str, Callable[[], list[Figure]]]]:
+    """Yield each module of a subject, and the function that returns its figures."""
+    for name in subject.modules:
+        yield name, partial(figures_of, name)
+    with ProcessPoolExecutor(max(len(subject.together), 1), get_context('spawn')) as pool:
+        running = [(name, pool.submit(figures_of, name)) for name in subject.together]
+        yield from ((name, future.result) for name, future in running)
+
+
+def as_json(
+    name: str, subject: Subject, figures: list[Figure], errors: dict[str, str], seconds: float
+) -> str:
+    """Return the figures as one JSON object."""
+    rows = [asdict(figure) | {'passes': figure.passes} for figure in figures]
+    content = {
+        'subject': name,
+        'seconds': round(seconds, 1),
+        'figures': rows,
+        'errors': errors,
+        'not_covered': {str(line): why for line, why in subject.not_covered.items()},
+    }
+    return json.dumps(content, indent=2)
+
+
+def print_table(
+    subject: Subject, figures: list[Figure], errors: dict[str, str], seconds: float
+) -> None:
+    """Print the figures for people."""
+    for figure in sorted(figures, key=lambda figure: figure.line):
+        verdict = 'ok   ' if figure.passes else 'SHORT'
+        unit = f' {figure.unit}' if figure.unit else ''
+        print(
+            f'{verdict} line {figure.line}: {figure.name}: {figure.value:.4g}{unit}, '
+            f'{figure.side} {figure.bound:.4g}{unit} (n = {figure.samples})'
+        )
+        if figure.reference:
+            print(f'      as a ratio to {figure.reference}; {figure.absolute}')
+    for name, error in errors.items():
+        print(f'SHORT {name} could not be measured: {error}')
+    for line, why in subject.not_covered.items():
+        print(f'      line {line} is not covered: {why}')
+    print(f'{seconds:.1f} s')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Figures of the stiffening law: against quadratic elements, adaptive against everywhere, yanks."""
+
+import time
+from typing import Any
+
+import numpy as np
+
+from bench.accuracy.law_problems import CASES, compared, settled, solved_reference
+from bench.accuracy.law_problems import unstructured_block as block_of
+from bench.common.meshes import kuhn_block
+from bench.figures.figure import Figure
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName, internal_force
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+
+STIFFENING = 6.0
+EDGE_M = 0.006
+"""Mean edge of the unstructured meshes [m]."""
+COMPARED = (('press 30 %', 0.45), ('stretch 30 %', 0.45))
+YANKS, RELEASED_FRAMES = 6, 30
+SLIVER_SEEDS = (0, 1)
+EVALUATIONS = 200
+
+
+def measure() -> list[Figure]:
+    """Measure all figures of the law."""
+    return [*against_reference(), *adaptive_against_full(), *yanked(), *cost()]
+
+
+def against_reference() -> list[Figure]:
+    """Measure force and field against quadratic hexahedra of the same law."""
+    errors = []
+    for name, nu in COMPARED:
+        case = CASES[name]
+        reference = solved_reference(case, nu, STIFFENING, 4)
+        errors.append(compared(case, reference, nu, EDGE_M, 1))
+    n = len(errors)
+    return [
+        Figure(2, 'force against quadratic elements of the law', max(abs(e.force) for e in errors),
+               0.05, 'at most', '', n),
+        Figure(2, 'field against quadratic elements of the law', max(e.field for e in errors),
+               0.07, 'at most', '', n),
+    ]  # fmt: skip
+
+
+def adaptive_against_full() -> list[Figure]:
+    """Measure what the tolerance changes, at a press by a tenth of the height."""
+    case, found = CASES['punch 10 %'], []
+    mesh = block_of(case, EDGE_M, 1)
+    for tolerance in (0.0, None):
+        more: dict[str, Any] = {} if tolerance is None else {'tolerance': tolerance}
+        found.append(settled(case, mesh, 0.45, STIFFENING, **more))
+    (_, full, right), (_, some, force) = found
+    field = float(np.linalg.norm(some - full) / np.linalg.norm(full))
+    return [
+        Figure(3, 'force, adaptive against the law everywhere', abs(force / right - 1), 0.02,
+               'at most', '', 1),
+        Figure(3, 'field, adaptive against the law everywhere', field, 0.03, 'at most', '', 1),
+    ]  # fmt: skip
+
+
+def yanked() -> list[Figure]:
+    """Measure frames that are not finite, and J a second after release, on sliver meshes."""
+    bad, away = 0, 0.0
+    for seed in SLIVER_SEEDS:
+        rng = np.random.default_rng(seed)
+        mesh = _slivers(rng)
+        material = Material(5400.0, 0.45, 1060.0, 15.0, 1e-4, STIFFENING)
+        stepping = TimeStepping('symplectic_euler', max_substeps=2000)
+        dynamics = Dynamics(mesh, material, 'stiffening', stepping)
+        top = np.array([0.0125, 0.01, 0.02])
+        held = np.argsort(np.square(mesh.rest - top).sum(axis=1))[:3]
+        here = mesh.rest[held].mean(axis=0)
+        for _ in range(YANKS):
+            there = top + rng.normal(size=3) * 0.03 / np.sqrt(3)
+            spring = Coupling(HOLD, held, np.full(3, 1 / 3), here, there, np.zeros(3), 200.0)
+            bad += not np.isfinite(dynamics.advance(spring).elastic_force).all()
+            here = there
+        for _ in range(RELEASED_FRAMES):
+            motion = dynamics.advance(Coupling())
+            bad += not np.isfinite(motion.elastic_force).all()
+        assert motion.strain is not None
+        away = max(away, 1 - motion.strain.ratio[0], motion.strain.ratio[1] - 1)
+    frames = len(SLIVER_SEEDS) * (YANKS + RELEASED_FRAMES)
+    return [
+        Figure(5, 'frames with a number that is not finite', bad, 0, 'at most', '', frames),
+        Figure(5, '|J - 1| a second after release', away, 0.1, 'at most', '', len(SLIVER_SEEDS)),
+    ]  # fmt: skip
+
+
+def _slivers(rng: np.random.Generator) -> TetMesh:
+    mesh = kuhn_block((5, 4, 4), (0.025, 0.02, 0.02))
+    nodes = mesh.rest.copy()
+    inner = ((nodes > 1e-9) & (nodes < np.array([0.025, 0.02, 0.02]) - 1e-9)).all(axis=1)
+    nodes[inner] += rng.uniform(-0.24, 0.24, (int(inner.sum()), 3)) * 0.005
+    return TetMesh(nodes, mesh.tetrahedra, nodes[:, 2] < 1e-9)
+
+
+def cost() -> list[Figure]:
+    """Measure an evaluation under a dent as the demo's, as a ratio to linear_smoothed."""
+    times = {name: _evaluation(name) for name in ('linear_smoothed', 'stiffening')}
+    ratio = times['stiffening'] / times['linear_smoothed']
+    return [
+        Figure(3, 'cost of a force evaluation in a dent', ratio, 1.5, 'at most', '', EVALUATIONS,
+               'that of linear_smoothed', f'{1e6 * times["stiffening"]:.0f} us')
+    ]  # fmt: skip
+
+
+def _evaluation(name: ModelName) -> float:
+    """Return the median CPU time of a force evaluation [s]."""
+    mesh = kuhn_block((20, 20, 8), (0.1, 0.1, 0.04))
+    model = ElasticModel(mesh, Material(5400.0, 0.45, 1060.0, stiffening=STIFFENING), name)
+    rest = mesh.rest
+    depth = 0.006 * np.exp(-np.square(rest - [0.05, 0.05, 0.04]).sum(axis=1) / 0.01**2)
+    u = np.stack([0 * depth, 0 * depth, -depth], axis=1).ravel()
+    operands, f = model.operands(), np.zeros_like(u)
+    times = []
+    for _ in range(EVALUATIONS):
+        start = time.thread_time()
+        internal_force(operands, u, f, 1)
+        times.append(time.thread_time() - start)
+    return float(np.median(times))

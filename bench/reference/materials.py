@@ -1,0 +1,48 @@
+"""Writes docs/materials.md from the presets.
+
+Run as `python -m bench.reference.materials` in the checkout after a change of the presets.
+"""
+
+from cutting_trainer.node_common.share import PACKAGES
+from cutting_trainer.tissue_sim.presets import PRESETS
+from cutting_trainer.tissue_sim.settings import MaterialSettings
+
+FILE = PACKAGES / 'docs' / 'materials.md'
+_PAGE = """# Materials
+
+<!-- Written by `python -m bench.reference.materials` from the presets. -->
+
+Values of `tissue.material.preset`, and the source of each number. A number is read in a table, on
+a page or in an abstract, *computed* from one, *borrowed* from another species, or *chosen* for want
+of a source. A number that was not found is absent. The scene must then give `density`;
+`toughness` has its default of {toughness:g} J/m^2, `stiffening` and `friction` have 0.
+
+| preset | key | value | read in | source |
+|---|---|---|---|---|
+{numbers}
+
+Looked for and not found:
+
+| preset | numbers |
+|---|---|
+{missing}
+"""
+
+
+def page() -> str:
+    """Return the page."""
+    numbers = [
+        f'| `{name}` | `{key}` | {number.value:g} | {number.how} | {number.source} |'
+        for name, preset in PRESETS.items()
+        for key, number in preset.numbers.items()
+    ]
+    missing = [
+        f'| `{name}` | {", ".join(f"`{key}`" for key in preset.not_found)} |'
+        for name, preset in PRESETS.items()
+    ]
+    toughness = MaterialSettings.model_fields['toughness'].default
+    return _PAGE.format(toughness=toughness, numbers='\n'.join(numbers), missing='\n'.join(missing))
+
+
+if __name__ == '__main__':
+    FILE.write_text(page(), encoding='utf-8')

@@ -1,0 +1,280 @@
+"""`bench soak`: run many sessions on the same processes, and check the growth of resources."""
+
+import json
+import shutil
+import tempfile
+import time
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.node import Node
+from rich.console import Console
+from rich.table import Table
+
+from bench.trials.chaos import bags_of
+from bench.trials.chaos_verdict import force_failures
+from bench.trials.operator import Operator
+from cutting_trainer.haptic_bridge.settings import DeviceProfile
+from cutting_trainer.session.demo import report_failed_start
+from cutting_trainer.session.domain import reserved_domain
+from cutting_trainer.session.graph import (
+    CUTTING_NODE,
+    RECORDER_NODE,
+    TISSUE_NODE,
+    node_environment,
+    recorder_command,
+    simulation_nodes,
+)
+from cutting_trainer.session.progress import SessionProgress
+from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.status import Status
+from cutting_trainer.session.supervisor import Supervisor
+from cutting_trainer.session.terminal import session_console
+
+RESTARTED_NODES = (RECORDER_NODE, TISSUE_NODE, CUTTING_NODE)
+"""Nodes that restart with each session; the others, and all processes, go on."""
+STEPS = (
+    Transition.TRANSITION_DEACTIVATE,
+    Transition.TRANSITION_CLEANUP,
+    Transition.TRANSITION_CONFIGURE,
+    Transition.TRANSITION_ACTIVATE,
+)
+SAMPLE_PERIOD_S = 5.0
+"""Period of the samples of the processes."""
+WARM_UP_SHARE = 0.2
+"""Share of the duration that does not count: allocators and caches fill."""
+MAX_RELATIVE_GROWTH = 0.05
+"""Allowed relative growth from the first counted quarter to the last."""
+TRANSITION_TIMEOUT_S = 60.0
+"""Timeout of a lifecycle transition."""
+MAX_ABSOLUTE_GROWTH = {'memory [MB]': 4.0, 'threads': 0.5, 'file handles': 2.0, 'DDS entities': 2.0}
+"""Allowed absolute growth of each resource."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Sample of the resources of a process, or of the graph.
+
+    Attributes:
+        seconds: [s] since the start.
+        subject: node of the process, or `graph`.
+        values: values by the names of `MAX_ABSOLUTE_GROWTH`.
+    """
+
+    seconds: float
+    subject: str
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class SoakOptions:
+    """Options of `soak`.
+
+    Attributes:
+        scene: name or path.
+        minutes: duration [min].
+        every: length of a session [s].
+        seed: seed of the places of the hand.
+        domain: ROS domain, or `free`.
+        as_json: print the outcome as JSON.
+    """
+
+    scene: str
+    minutes: float
+    every: float
+    seed: int
+    domain: int | Literal['free']
+    as_json: bool
+
+
+def sample_process(name: str, pid: int, seconds: float) -> Sample | None:
+    """Return memory, threads and open files of a process; None when it has ended."""
+    try:
+        status = Path(f'/proc/{pid}/status').read_text(encoding='utf-8')
+        files = len(list(Path(f'/proc/{pid}/fd').iterdir()))
+    except OSError:
+        return None
+    fields = dict(line.split(':', 1) for line in status.splitlines() if ':' in line)
+    memory = float(fields['VmRSS'].split()[0]) / 1024
+    values = {'memory [MB]': memory, 'threads': float(fields['Threads']), 'file handles': files}
+    return Sample(seconds, name, values)
+
+
+def entities(node: Node) -> int:
+    """Return the number of publishers, subscriptions, services and clients of the graph."""
+    count = 0
+    for topic, _ in node.get_topic_names_and_types():
+        count += node.count_publishers(topic) + node.count_subscribers(topic)
+    for name, namespace in node.get_node_names_and_namespaces():
+        count += len(node.get_service_names_and_types_by_node(name, namespace))
+        count += len(node.get_client_names_and_types_by_node(name, namespace))
+    return count
+
+
+def growth_failures(samples: list[Sample]) -> list[str]:
+    """Return a sentence for each resource that grew beyond its allowance after the warm-up."""
+    series: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+    for sample in samples:
+        for name, value in sample.values.items():
+            series[sample.subject, name].append((sample.seconds, value))
+    found = []
+    for (subject, name), rows in series.items():
+        first, last = quarters(np.array(rows))
+        if (
+            last
+            > first * (1 + (MAX_RELATIVE_GROWTH if name == 'memory [MB]' else 0))
+            + MAX_ABSOLUTE_GROWTH[name]
+        ):
+            found.append(f'{name} of {subject} grew from {first:.4g} to {last:.4g}')
+    return found
+
+
+def remove_old(bags: list[Path]) -> None:
+    """Remove all bags but the two newest, by time: a recorder reuses free names."""
+    there = [bag for bag in bags if bag.is_dir()]
+    for old in sorted(there, key=lambda bag: bag.stat().st_mtime_ns)[:-2]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def quarters(rows: np.ndarray) -> tuple[float, float]:
+    """Return medians of the first and the last quarter of what counts, rows of time and value."""
+    start, end = WARM_UP_SHARE * rows[-1, 0], rows[-1, 0]
+    quarter = (end - start) / 4
+    early = rows[(rows[:, 0] >= start) & (rows[:, 0] <= start + quarter), 1]
+    return float(np.median(early)), float(np.median(rows[rows[:, 0] >= end - quarter, 1]))
+
+
+class _SessionCycle:
+    """Start the next session on the running processes, transition by transition."""
+
+    def __init__(
+        self, operator: Operator, profile: DeviceProfile, folder: Path, every: float
+    ) -> None:
+        self.sessions, self.failures = 1, list[str]()
+        self._operator, self._profile = operator, profile
+        self._folder, self._every = folder, every
+        self._clients = {
+            name: operator.node.create_client(ChangeState, f'{name}/change_state')
+            for name in RESTARTED_NODES
+        }
+        self._due = every
+        self._left: list[tuple[str, int]] = []
+        self._answer: Any = None
+        self._since = 0.0
+
+    def tick(self, elapsed: float) -> None:
+        """Start the next transition when the present one is done."""
+        if elapsed >= self._due and not self._left:
+            self._due, self._since = self._due + self._every, elapsed
+            self.judge()
+            self._left = [(name, step) for step in STEPS for name in RESTARTED_NODES]
+        if not self._left:
+            return
+        name, step = self._left[0]
+        if self._answer is None:
+            if self._clients[name].service_is_ready():
+                request = ChangeState.Request(transition=Transition(id=step))
+                self._answer = self._clients[name].call_async(request)
+        elif self._answer.done():
+            done, self._answer, self._since = self._answer.result().success, None, elapsed
+            self._left.pop(0)
+            if not done:
+                self.failures.append(f'{name} refused transition {step} at {elapsed:.0f} s')
+            if not self._left:
+                self.sessions += 1
+                remove_old(bags_of(self._folder / 'bag'))
+            return
+        if elapsed > self._since + TRANSITION_TIMEOUT_S:
+            self._left, self._answer = [], None
+            self.failures.append(f'{name} did not answer to transition {step} at {elapsed:.0f} s')
+
+    def judge(self) -> None:
+        """Check all forces since the last call."""
+        self.failures += force_failures(self._operator.take_seen(), [], self._profile)
+
+
+def run_soak(options: SoakOptions) -> Status:
+    """Run the sessions and print the growth.
+
+    Raises:
+        SessionError, SceneError, SettingsError: it cannot be run like this.
+    """
+    scene, notes = load_scene(options.scene), session_console()
+    samples: list[Sample] = []
+    with (
+        reserved_domain(options.domain) as domain,
+        tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
+        SessionProgress(notes, 5) as progress,
+        Supervisor(
+            [
+                *simulation_nodes(scene.path, options.seed, Path(temporary) / 'checkpoint'),
+                recorder_command(scene.path, Path(temporary) / 'bag', options.seed),
+            ],
+            Path(temporary) / 'log',
+            node_environment(domain),
+            progress.show,
+        ) as supervisor,
+    ):
+        if not supervisor.start():
+            return report_failed_start(supervisor.end(), Path(temporary), notes)
+        operator = Operator(scene, domain, options.seed)
+        profile = scene.device.load_profile()
+        renewal, due = _SessionCycle(operator, profile, Path(temporary), options.every), 0.0
+
+        def tick(elapsed: float) -> None:
+            nonlocal due
+            progress.tick(elapsed, 60 * options.minutes)
+            renewal.tick(elapsed)
+            if elapsed < due:
+                return
+            due += SAMPLE_PERIOD_S
+            for name, pid in supervisor.pids.items():
+                if (sample := sample_process(name, pid, elapsed)) is not None:
+                    samples.append(sample)
+            graph = {'DDS entities': float(entities(operator.node))}
+            samples.append(Sample(elapsed, 'graph', graph))
+
+        began = time.monotonic()
+        supervisor.run(60 * options.minutes, tick=tick)
+        minutes = (time.monotonic() - began) / 60
+        operator.end()
+        renewal.judge()
+        outcome = supervisor.end()
+    failures = [
+        *outcome.troubles,
+        *growth_failures(samples),
+        *renewal.failures,
+    ]
+    _report(samples, renewal.sessions, minutes, failures, as_json=options.as_json)
+    if outcome.interrupted:
+        return Status.INTERRUPTED
+    return Status.FAILED if failures else Status.OK
+
+
+def _report(
+    samples: list[Sample], sessions: int, minutes: float, failures: list[str], *, as_json: bool
+) -> None:
+    console = Console()
+    rows = []
+    for subject in sorted({sample.subject for sample in samples}):
+        own = [s for s in samples if s.subject == subject]
+        for name in own[0].values:
+            first, last = quarters(np.array([(s.seconds, s.values[name]) for s in own]))
+            rows.append((subject, name, first, last))
+    if as_json:
+        values = [dict(zip(('what', 'name', 'first', 'last'), row, strict=True)) for row in rows]
+        plain = {'minutes': minutes, 'sessions': sessions, 'quarters': values}
+        console.out(json.dumps({**plain, 'failures': failures}, indent=2), highlight=False)
+        return
+    table = Table('process', 'resource', 'first quarter', 'last quarter', box=None)
+    for subject, name, first, last in rows:
+        table.add_row(subject, name.replace('[', r'\['), f'{first:.4g}', f'{last:.4g}')
+    console.print(table)
+    console.print(f'{sessions} sessions in {minutes:.1f} min', highlight=False)
+    for failure in failures:
+        console.print(f'[bold red]not as it should be:[/] {failure}', highlight=False)

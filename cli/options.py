@@ -1,0 +1,32 @@
+"""Options and arguments that several commands have, declared once."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cutting_trainer.session.status import Status
+
+EXIT_STATUSES = 'Exit status: ' + '; '.join(f'{int(s)} {s.meaning}' for s in Status) + '.'
+
+_SCENE = 'Name of a scene in config/scenes, or path of a scene file.'
+
+BagArgument = Annotated[Path, typer.Argument(help='Folder of the bag.')]
+SceneArgument = Annotated[str, typer.Argument(help=_SCENE)]
+SceneOption = Annotated[str, typer.Option(help=_SCENE)]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help='Seed of everything random.')]
+Domain = Annotated[
+    str,
+    typer.Option(help='ROS domain; "free": one of its own; none: that of ROS_DOMAIN_ID, or 0.'),
+]
+AsJson = Annotated[
+    bool, typer.Option('--json', help='Print the outcome as JSON on standard output.')
+]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        '--with',
+        help='key=value of the scene that is to be otherwise; may be given again. Then the '
+        'recorded hand meets the changed tissue, and the differences are shown.',
+    ),
+]

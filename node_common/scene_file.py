@@ -1,0 +1,330 @@
+"""Scene files: YAML in, checked models out, and errors that state the remedy.
+
+A scene has one section for each folder that reads one; a folder describes its section by a model
+derived from `SceneModel` and reads it with `read_section`. YAML 1.2 applies: `1e-3` is a number,
+`yes` and `on` are words.
+"""
+
+import difflib
+import functools
+import json
+import types
+import typing
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.node_common.yaml_bounds import YamlBoundError, check_events, read_bounded
+
+SECTIONS = ('tissue', 'tool', 'device', 'haptics', 'cutting', 'arm', 'session')
+
+
+class SceneModel(BaseModel):
+    """Base of all models of a scene file: no unknown keys, no NaN, immutable."""
+
+    model_config = ConfigDict(
+        extra='forbid', frozen=True, allow_inf_nan=False, validate_default=True
+    )
+
+
+M = TypeVar('M', bound=BaseModel)
+
+
+def _existing_file(path: Path, info: ValidationInfo) -> Path:
+    folder = (info.context or {}).get('folder')
+    if folder is not None and not path.is_absolute():
+        path = (folder / path).resolve()
+    if not path.is_file():
+        raise ValueError(missing_file(path))
+    return path
+
+
+ScenePath = Annotated[Path, AfterValidator(_existing_file)]
+"""Path of an existing file; in a scene it is relative to the scene file."""
+
+
+def read_section(path: Path, section: str, model: type[M]) -> M:
+    """Read and check one section of a scene file.
+
+    A missing or empty section has the defaults of its model.
+
+    Args:
+        path: the scene file.
+        section: one of `SECTIONS`.
+        model: model of the section, preferably derived from `SceneModel`.
+
+    Raises:
+        SceneError: one sentence with file, line, key, value and remedy.
+    """
+    root = _compose(path)
+    document = _plain(root, path, ())
+    _check_sections(root, path)
+    content = document.get(section)
+    try:
+        return model.model_validate_json(
+            json.dumps({} if content is None else content, default=str),
+            strict=True,
+            context={'folder': path.parent.resolve()},
+        )
+    except ValidationError as error:
+        if content is None:
+            raise SceneError(_missing_section(path, section, error)) from None
+        place = _Place(path, section, _child(root, section) or root, model)
+        raise SceneError(_most_helpful(place, error.errors())) from None
+
+
+def missing_file(path: Path) -> str:
+    """Return a sentence about a missing file, with the most similar name in its folder."""
+    if path.is_dir():
+        return f'{path} is a folder: name the file in it'
+    if not path.parent.is_dir():
+        return f'{path} does not exist, nor does its folder {path.parent}: check the path'
+    alike = (e.name for e in path.parent.iterdir() if e.suffix == path.suffix and e.is_file())
+    near = nearest(path.name, alike)
+    return f'{path} does not exist: ' + (f'did you mean {near}?' if near else 'check the path')
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word most similar to a misspelt one, or None."""
+    matches = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return matches[0] if matches else None
+
+
+def _compose(path: Path) -> MappingNode:
+    if not path.is_file():
+        raise SceneError(f'scene file {missing_file(path)}')
+    try:
+        text = bounded_yaml(path)
+        root = YAML(typ='safe', pure=True).compose(text)
+    except YamlBoundError as error:
+        raise SceneError(error.of(path)) from None
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f'{path}: byte {error.start} is not UTF-8 text: a scene is a YAML file'
+        ) from None
+    except OSError as error:
+        raise SceneError(f'{path} cannot be read: {error.strerror}') from None
+    except YAMLError as error:
+        raise SceneError(syntax_error(path, error)) from None
+    expected = f'a scene is a mapping of the sections {", ".join(SECTIONS)}'
+    if root is None:
+        raise SceneError(f'{path} is empty: {expected}')
+    if not isinstance(root, MappingNode):
+        raise SceneError(f'{path}:{_line(root)}: the file is a {_kind(root)}: {expected}')
+    return root
+
+
+def bounded_yaml(path: Path) -> str:
+    """Return the text of a YAML file after a check that its number of values is bounded.
+
+    Raises:
+        YamlBoundError: it is too large, too deep, or repeats too much by aliases.
+        YAMLError, OSError, UnicodeDecodeError: it cannot be read.
+    """
+    text = read_bounded(path)
+    check_yaml(text)
+    return text
+
+
+@functools.lru_cache(maxsize=8)  # a scene is read once for each of its sections
+def check_yaml(text: str) -> None:
+    """Refuse YAML with too many values, too deep nesting, or values that contain themselves.
+
+    Raises:
+        YamlBoundError: the bound and the line.
+        YAMLError: it is not YAML.
+    """
+    check_events(YAML(typ='safe', pure=True).parse(text))
+
+
+def syntax_error(path: Path, error: YAMLError) -> str:
+    """Return a sentence about invalid YAML, with its place and the likely causes."""
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        reason = ' '.join(str(part) for part in (error.context, error.problem) if part)
+        return (
+            f'{path}:{mark.line + 1}: not valid YAML at column {mark.column + 1}: {reason}; '
+            'check indentation, colons, quotes and brackets here and in the line above'
+        )
+    reason = ' '.join(str(error).split())
+    return f'{path}: not valid YAML: {reason}; save it as plain text without control characters'
+
+
+def _plain(node: Node, path: Path, keys: tuple[str, ...], above: tuple[Node, ...] = ()) -> Any:
+    """Return the plain values of a node tree.
+
+    Values that would be lost or ambiguous are refused.
+    """
+    where = f'{path}:{_line(node)}: {_dotted(keys) or "the file"}'
+    if any(node is parent for parent in above):
+        raise SceneError(f'{where} contains itself by an alias: write the values out')
+    above = (*above, node)
+    if isinstance(node, MappingNode):
+        values: dict[str, Any] = {}
+        lines: dict[str, int] = {}
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, ScalarNode):
+                raise SceneError(
+                    f'{path}:{_line(key_node)}: a key is a {_kind(key_node)}: keys are words'
+                )
+            key = str(key_node.value)
+            if key in values:
+                raise SceneError(
+                    f'{path}:{_line(key_node)}: {_dotted((*keys, key))} is given twice, first in '
+                    f'line {lines[key]}: delete one of them'
+                )
+            values[key] = _plain(value_node, path, (*keys, key), above)
+            lines[key] = _line(key_node)
+        return values
+    if isinstance(node, SequenceNode):
+        return [_plain(n, path, (*keys, str(i)), above) for i, n in enumerate(node.value)]
+    try:
+        return YAML(typ='safe', pure=True).constructor.construct_object(node)
+    except (YAMLError, ValueError):
+        raise SceneError(
+            f'{where}: {_short(node.value)} with the tag {node.tag} cannot be read: write a plain '
+            'number or word without a tag'
+        ) from None
+
+
+def _check_sections(root: MappingNode, path: Path) -> None:
+    for key_node, value_node in root.value:
+        section = str(key_node.value)
+        if section not in SECTIONS:
+            near = nearest(section, SECTIONS)
+            hint = f'did you mean {near}?' if near else f'known are {", ".join(SECTIONS)}'
+            raise SceneError(f'{path}:{_line(key_node)}: {section} is not a section: {hint}')
+        empty = isinstance(value_node, ScalarNode) and str(value_node.tag).endswith(':null')
+        if not empty and not isinstance(value_node, MappingNode):
+            raise SceneError(
+                f'{path}:{_line(value_node)}: section {section} is a {_kind(value_node)}: it must '
+                'be a mapping of keys to values'
+            )
+
+
+def _missing_section(path: Path, section: str, error: ValidationError) -> str:
+    needed = ', '.join(_dotted(e['loc']) for e in error.errors() if e['type'] == 'missing')
+    return f'{path}: section {section} is missing' + (f': it needs {needed}' if needed else '')
+
+
+@dataclass(frozen=True)
+class _Place:
+    """One section of one file; turns the errors of its model into sentences."""
+
+    path: Path
+    section: str
+    node: Node
+    model: type[BaseModel]
+
+    def locate(self, loc: tuple[int | str, ...]) -> tuple[int, tuple[str, ...]]:
+        """Return line and key path of an error.
+
+        Parts of `loc` that name a model are skipped.
+        """
+        node, line, keys = self.node, _line(self.node), [self.section]
+        for part in loc:
+            found = _key_and_value(node, part)
+            if found is not None:
+                line, node = _line(found[0]), found[1]
+                keys.append(str(part))
+        return line, tuple(keys)
+
+    def sentence(self, error: ErrorDetails) -> str:
+        line, keys = self.locate(error['loc'])
+        models, field = _described(self.model, error['loc'])
+        about = f' ({field.description})' if field is not None and field.description else ''
+        head = f'{self.path}:{line}: {_dotted(keys)}'
+        if error['type'] == 'missing':
+            return f'{head} is {_short(error["input"])}: {error["loc"][-1]} is missing{about}'
+        if error['type'] == 'extra_forbidden':
+            known = list(dict.fromkeys(name for m in models for name in m.model_fields))
+            near = nearest(keys[-1], known)
+            hint = f'did you mean {near}?' if near else f'known are {", ".join(known)}'
+            return f'{head} is not a key here: {hint}'
+        if error['type'] in ('value_error', 'assertion_error'):
+            return f'{head}: {error["ctx"]["error"]}'
+        reason = error['msg'][:1].lower() + error['msg'][1:]
+        return f'{head} is {_short(error["input"])}: {reason}{about}'
+
+
+def _most_helpful(place: _Place, errors: list[ErrorDetails]) -> str:
+    """Return the first error; unknown keys come before other errors, parts before their whole.
+
+    An unknown key often explains a missing one, and a bad item a list that is too short.
+    """
+
+    def rank(error: ErrorDetails) -> tuple[bool, bool, int]:
+        loc = error['loc']
+        whole = any(other['loc'][: len(loc)] == loc != other['loc'] for other in errors)
+        return error['type'] != 'extra_forbidden', whole, place.locate(loc)[0]
+
+    return place.sentence(min(errors, key=rank))
+
+
+def _described(
+    model: type[BaseModel], loc: tuple[int | str, ...]
+) -> tuple[list[type[BaseModel]], FieldInfo | None]:
+    """Return the models that have the last part of `loc` as a key, and its field or the last
+    known.
+    """
+    models, field = [model], None
+    for i, part in enumerate(loc):
+        fields = [m.model_fields[part] for m in models if part in m.model_fields]
+        if not fields:
+            narrowed = [m for m in models if m.__name__ == part]
+            models = narrowed or models
+            continue
+        field = fields[0]
+        inner = [m for f in fields for m in _models_in(f.annotation)]
+        if i + 1 < len(loc):
+            models = inner or models
+    return models, field
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, types.GenericAlias) or typing.get_origin(annotation) is not None:
+        for argument in typing.get_args(annotation):
+            yield from _models_in(argument)
+    elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+
+
+def _key_and_value(node: Node, part: int | str) -> tuple[Node, Node] | None:
+    if isinstance(node, MappingNode):
+        return next(((k, v) for k, v in node.value if str(k.value) == str(part)), None)
+    if isinstance(node, SequenceNode) and isinstance(part, int) and part < len(node.value):
+        return node.value[part], node.value[part]
+    return None
+
+
+def _child(node: Node, key: str) -> Node | None:
+    found = _key_and_value(node, key)
+    return found[1] if found else None
+
+
+def _line(node: Node) -> int:
+    return int(node.start_mark.line) + 1
+
+
+def _kind(node: Node) -> str:
+    if isinstance(node, MappingNode):
+        return 'mapping'
+    return 'list' if isinstance(node, SequenceNode) else 'single value'
+
+
+def _dotted(keys: Iterable[int | str]) -> str:
+    return '.'.join(str(key) for key in keys)
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, default=str) if not isinstance(value, str) else repr(value)
+    return text if len(text) <= 60 else text[:57] + '...'

@@ -1,1 +1,0 @@
-"""What measures models, cuts, haptics and timing, and writes the pages of docs/ about them."""

@@ -1,1 +1,0 @@
-"""From the surface of an organ to a mesh and a scene."""

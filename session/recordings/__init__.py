@@ -1,1 +1,0 @@
-"""What is done with a recorded session: replay, re-simulation, report, export, repair."""

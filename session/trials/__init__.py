@@ -1,1 +1,0 @@
-"""Hard trials of a whole session: faults at random, long days, malformed messages."""

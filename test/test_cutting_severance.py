@@ -1,0 +1,97 @@
+"""The swept surface is severed, where the blade went, and as deep as it went."""
+
+import numpy as np
+import pytest
+from strokes import draw, method_named
+
+from bench.cuts.curves import Cut, Organ, circle, curved, four_lines, organ_of, scattered, slab
+from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free
+from bench.cuts.strokes import good_block
+from cutting_trainer.cutting.checks import check_mesh, cut_face_area
+from cutting_trainer.cutting.combined import FOLDED
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+
+
+@pytest.fixture(scope='module')
+def plate() -> Organ:
+    return slab((12, 12, 2))
+
+
+@pytest.mark.parametrize(('ratio', 'seed'), [(2, 0), (2, 3), (2, 6), (3, 2), (3, 3), (4, 1)])
+def test_a_circle_through_a_slab_frees_its_plug_where_the_blade_went(plate, ratio, seed):
+    run = measure(plate, circle(plate, ratio, np.random.default_rng(seed)), check=True)
+    assert run.error == ''
+    assert run.free and run.faces == 0
+    assert run.folds == 0 and run.said == ()
+    assert np.sqrt((run.distances**2).mean()) < 0.06
+
+
+@pytest.mark.parametrize('shape', ['arc', 'wave', 'spiral', 'loop'])
+def test_a_curved_stroke_leaves_no_bridge(plate, shape):
+    for seed in range(2):
+        run = measure(plate, curved(plate, shape, np.random.default_rng(seed)))
+        assert run.error == ''
+        assert run.faces == 0 or run.said
+
+
+def test_a_bridge_is_found_where_one_is(plate):
+    """The measure itself: the stroke leaves out twelve steps, more than an element."""
+    cut = circle(plate, 4, np.random.default_rng(0))
+    path = cut.paths[0]
+    gap = len(path) // 2
+    torn = Cut((path[:gap], path[gap + 12 :]), False, cut.inside, cut.radius)
+    whole = Cut((path,), True, cut.inside, cut.radius)
+    mesh, _, error = cut_mesh(plate, torn)
+    assert error == ''
+    assert not plug_is_free(mesh, whole, plate.h)
+    assert bridges_of(mesh, whole, plate.h)[1] > 0
+
+
+def test_four_lines_free_a_square(plate):
+    run = measure(plate, four_lines(plate, 3, np.random.default_rng(1)))
+    assert run.error == '' and run.faces == 0 and run.free
+
+
+def test_slivers_are_cut_at_their_nodes():
+    """Flat elements cannot be divided; the tissue does not stay connected there."""
+    organ = scattered()
+    run = measure(organ, circle(organ, 3, np.random.default_rng(1)))
+    assert run.error == '' and run.free and run.said == ()
+
+
+@pytest.mark.parametrize('depth', [0.005, 0.02, 0.05])
+def test_a_blade_parallel_to_the_surface_takes_no_volume(depth):
+    nodes, tetrahedra = good_block((6, 5, 4), 0.005, seed=1)
+    mesh = TetMesh(nodes, tetrahedra)
+    volume = float(mesh.volumes().sum())
+    z = nodes[:, 2].max() - depth * 0.005
+    x = np.linspace(-0.004, 0.034, 20)
+    ends = [np.column_stack([x, np.full_like(x, y), np.full_like(x, z)]) for y in (-0.003, 0.028)]
+    draw(method_named(), mesh, np.stack(ends, axis=1))
+    check_mesh(mesh, volume)
+
+
+@pytest.mark.parametrize('depth', [1.0, 2.0, 4.0])
+def test_the_opened_area_is_the_swept_one(depth):
+    """In the mean of some directions: a front follows the elements, now beyond, now short."""
+    nodes, tetrahedra = good_block((8, 8, 6), 0.005, seed=0)
+    block = organ_of('block', nodes, tetrahedra)
+    opened, swept = 0.0, 0.0
+    high = nodes[:, 2].max()
+    for angle in np.linspace(0.1, 3.0, 6):
+        along = np.array([np.cos(angle), np.sin(angle), 0.0])
+        way = np.linspace(-0.035, 0.035, 60)[:, None] * along + block.middle
+        path = np.stack([way, way], axis=1)
+        path[:, 0, 2], path[:, 1, 2] = high + 0.003, high - depth * block.h
+        mesh, warnings, error = cut_mesh(block, Cut((path,)))
+        assert error == '' and FOLDED not in warnings
+        opened += cut_face_area(mesh)
+        swept += depth * block.h * 0.04 / np.abs(along).max()
+    assert opened / swept == pytest.approx(1.0, abs=0.08)
+
+
+def test_the_same_strokes_cut_the_same_mesh(plate):
+    cut = curved(plate, 'loop', np.random.default_rng(5))
+    one, two = (cut_mesh(plate, cut)[0] for _ in range(2))
+    assert one.rest.tobytes() == two.rest.tobytes()
+    assert one.tetrahedra.tobytes() == two.tetrahedra.tobytes()

@@ -1,0 +1,236 @@
+"""Claims about the page in a browser: what is pressed arrives, what is said is shown.
+
+The server is the real one; behind it is a session that is none (page_world.py).
+"""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from page_world import StandIn
+
+from bench.page.browser import CHROMIUM, Browser, Page, chromium
+from cutting_trainer.viewer.protocol import EStop, Guide, Play, ResetEStop, Seek
+
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(
+        CHROMIUM is None, reason='chromium is not installed: sudo apt install chromium'
+    ),
+]
+
+SIZES = ((390, 844), (820, 1180), (1280, 800), (2560, 1440), (844, 390))
+EVIL = '<img src=x onerror="window.evil=1"><script>window.evil=2</script>'
+WATCH = """window.broken = [];
+document.addEventListener('securitypolicyviolation', e => window.broken.push(e.blockedURI));
+window.addEventListener('error', e => window.broken.push(e.message));"""
+WHAT_IS_THERE = """(() => {
+    const r = document.querySelector('#e-stop').getBoundingClientRect();
+    const shares = [0.05, 0.5, 0.95];
+    const seen = shares.flatMap(x => shares.map(y => document.elementFromPoint(
+        r.x + x * r.width, r.y + y * r.height)?.id ?? ''));
+    return {seen, width: r.width, height: r.height, bottom: r.bottom, right: r.right};
+})()"""
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Browser]:
+    with chromium((1000, 700)) as browser:
+        yield browser
+
+
+@contextmanager
+def opened(browser: Browser, stand_in: StandIn) -> Iterator[Page]:
+    """A page on a session, with its picture."""
+    with closing(stand_in):
+        page = browser.page()
+        page.call('Page.addScriptToEvaluateOnNewDocument', source=WATCH)
+        page.open(stand_in.url)
+        page.wait(lambda: page.state().get('tip') and page.state()['meshes'], 'the page')
+        yield page
+        assert page.evaluate('window.broken') == []
+        page.open('about:blank')
+
+
+def key(page: Page, code: str, name: str) -> None:
+    for kind in ('keyDown', 'keyUp'):
+        page.call('Input.dispatchKeyEvent', type=kind, code=code, key=name)
+
+
+def stop_by_key(page: Page, stand_in: StandIn, code: str, name: str) -> None:
+    before = len(stand_in.of(EStop))
+    key(page, code, name)
+    stand_in.wait(lambda: len(stand_in.of(EStop)) > before)
+
+
+def guided(page: Page) -> np.ndarray:
+    """Lets the force in; where the blade is in the window then [pixel]."""
+    page.press('start')
+    page.wait(lambda: page.state()['canGuide'], 'the hand')
+    return np.array(page.state()['tip'])
+
+
+def test_e_stop_arrives_by_mouse_and_by_key_and_is_in_sight_at_every_size(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        page.press('start')
+        page.press('e-stop')
+        page.wait(lambda: page.state()['eStopped'], 'the stop')
+        assert page.evaluate("document.querySelector('#start').disabled")
+        for width, height in SIZES:
+            page.resize(width, height)
+            page.evaluate("document.querySelector('#panel').scrollTop = 1e6")
+            there = page.evaluate(WHAT_IS_THERE)
+            assert set(there['seen']) == {'e-stop'}, (width, height, there)
+            assert there['width'] >= 100 and there['height'] >= 44
+            assert there['bottom'] <= height and there['right'] <= width
+        page.resize(1000, 700)
+        page.press('reset-e-stop')
+        page.wait(lambda: not page.state()['eStopped'], 'the reset')
+        assert len(stand_in.of(ResetEStop)) == 1
+        for code, name in (('Space', ' '), ('Escape', 'Escape')):
+            page.evaluate("document.querySelector('#pause').focus()")  # which Space would press
+            stop_by_key(page, stand_in, code, name)
+        assert not [message for message in stand_in.asked if message.op == 'pause']
+
+
+def test_one_drag_at_the_blade_takes_it_down_and_along(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        tip = guided(page)
+        before = stand_in.tip.copy()
+        view = page.state()['camera']
+        down = page.pixels(before + np.array([[0.0, 0.0, -0.02]]))[0]
+        page.drag(np.array([tip, *np.linspace(tip, down, 5), down + np.array([60.0, 0.0])]))
+        goals = stand_in.of(Guide)
+        assert goals
+        lowest = min(goal.position[2] for goal in goals)
+        assert lowest == pytest.approx(before[2] - 0.02, abs=0.003)
+        assert goals[-1].position[0] > before[0] + 0.005
+        assert page.state()['camera'] == view  # it was no turn of the view
+        stand_in.wait(lambda: np.allclose(stand_in.tip, goals[-1].position, atol=1e-3))
+        page.drag(np.array([[380.0, 600.0], [390.0, 600.0], [450.0, 610.0]]))
+        assert page.state()['camera'] != view  # beside the blade it is one
+        assert stand_in.of(Guide) == goals
+
+
+def test_goals_come_at_thirty_a_second_at_most_and_none_once_the_force_is_off(
+    browser: Browser,
+) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        events = """new Promise(done => {
+            const view = document.querySelector('#view'), began = performance.now();
+            const [x, y] = window.page.state.tip;
+            const say = (kind, dy) => view.dispatchEvent(new PointerEvent(kind, {
+                pointerId: 1, button: 0, clientX: x, clientY: y + dy, bubbles: true}));
+            view.setPointerCapture = () => {};
+            say('pointerdown', 0);
+            const timer = setInterval(() => {
+                for (let i = 0; i < 5; i += 1) say('pointermove', 5 * Math.random());
+                if (performance.now() - began < 1000) return;
+                clearInterval(timer);
+                done(performance.now() - began);
+            }, 4);
+        })"""
+        took = page.call(
+            'Runtime.evaluate', expression=events, awaitPromise=True, returnByValue=True
+        )
+        most = 30 * took['result']['value'] / 1000 + 2
+        assert 3 <= len(stand_in.of(Guide)) <= most
+        assert page.state()['dragging']
+        key(page, 'Escape', 'Escape')
+        page.wait(lambda: not page.state()['canGuide'], 'the stop')
+        assert not page.state()['dragging']
+
+
+def test_what_others_wrote_is_shown_as_text_and_nothing_of_it_runs(browser: Browser) -> None:
+    rows = [{'name': EVIL, 'level': 1, 'message': EVIL, 'rate': 1.0}]
+    says: Any = {
+        'hello': {'title': EVIL, 'scenes': [EVIL, 'liver']},
+        'nodes': {'rows': rows},
+        'session': {'scene': EVIL, 'recording': EVIL, 'scenes': [EVIL]},
+        'state': {'text': EVIL},
+    }
+    stand_in = StandIn('block', **says)
+    with opened(browser, stand_in) as page:
+        stand_in.server.put('notice', id=1, text=EVIL)
+        page.wait(lambda: EVIL in page.state()['notices'], 'the notice')
+        for place in ('#nodes', '#state-text', '#title', '#busy', '#notices', '#scene'):
+            text = page.evaluate(f'document.querySelector({json.dumps(place)}).textContent')
+            assert '<script>' in text, place
+        assert page.evaluate('window.evil') is None
+        assert not page.evaluate("document.querySelectorAll('body img, body script').length")
+
+
+def test_a_refusal_is_said(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        page.evaluate("""(s => { s.max = 99; s.value = 50;
+            s.dispatchEvent(new Event('change')); })(document.querySelector('#scale'))""")
+        page.wait(lambda: page.says('force scale is from 0.1 to 3'), 'the refusal')
+
+
+def test_a_lost_connection_is_said_and_the_stop_pressed_meanwhile_arrives_first(
+    browser: Browser,
+) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        port = stand_in.server.port
+        guided(page)
+        stand_in.stop()
+        page.wait(lambda: page.says('Connection lost'), 'the banner')
+        assert page.evaluate("document.querySelector('#pause').disabled")
+        page.press('e-stop')
+        page.wait(lambda: page.says('E-STOP NOT SENT'), 'the warning')
+        with closing(StandIn('block', port=port)) as again:
+            page.wait(lambda: page.state()['connection'] == 'open', 'the connection')
+            again.wait(lambda: again.asked)
+            assert isinstance(again.asked[0], EStop)
+            page.wait(lambda: page.state()['eStopped'], 'the stop')
+            assert not page.says('Connection lost')
+            page.press('reset-e-stop')  # the page does not press again what it has heard to hold
+            page.wait(lambda: not page.state()['eStopped'], 'the reset')
+            count = len(again.of(EStop))
+            time.sleep(1.0)
+            assert len(again.of(EStop)) == count and not again.e_stopped
+
+
+def test_news_that_is_old_is_called_old(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        assert not page.state()['stale']
+        stand_in.stands_still.set()
+        page.wait(lambda: page.says('No news from the session'), 'the banner')
+        assert page.state()['connection'] == 'open'
+        stand_in.stands_still.clear()
+        page.wait(lambda: not page.says('No news from the session'), 'its end')
+
+
+def test_replay_plays_and_goes_to_a_time_and_names_both_tissues(browser: Browser) -> None:
+    stand_in = StandIn('block', 'replay')
+    with opened(browser, stand_in) as page:
+        assert page.says('recorded') and page.says('tougher')
+        assert not page.says('E-STOP')
+        assert set(page.state()['parts']) == {'tissue', 'computed'}
+        page.press('play')
+        stand_in.wait(lambda: stand_in.of(Play))
+        page.slide('seek', 0.25)
+        stand_in.wait(lambda: stand_in.of(Seek))
+        assert stand_in.of(Seek)[-1].time == pytest.approx(5.0, abs=0.7)
+        page.wait(lambda: page.evaluate("document.querySelector('#play').innerText") == 'Pause', '')
+
+
+def test_page_asks_only_this_server_for_what_it_shows(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        page.state()
+        site = stand_in.url.partition('/?')[0]
+        assert page.requests
+        for url in page.requests:
+            assert url.startswith((site, site.replace('http', 'ws'), 'about:')), url

@@ -1,0 +1,97 @@
+"""Each piece that comes off is told once, with its volume."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from meshes import irregular_box
+from strokes import draw, method_named, straight
+
+from cutting_trainer.tissue_sim.contact.tool import ContactState
+from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister, free_parts, pieces_of
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.node import TissueSimNode
+
+SIZE = np.array([0.06, 0.06, 0.012])
+UP = (0.0, 0.0, 0.020)
+SIDES = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+
+
+def held_at_its_sides() -> TetMesh:
+    nodes, tets = irregular_box((15, 15, 3), 0.004, 3)
+    nodes = nodes - [SIZE[0] / 2, SIZE[1] / 2, 0.0]
+    return TetMesh(nodes, tets, (np.abs(nodes[:, 0]) > 0.0299).astype(np.uint8))
+
+
+def excise(mesh, centre, half, angle):
+    """Cut around a square prism by four straight strokes; return its volume at rest [m^3]."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for side in SIDES:
+        along = turn @ [-side[1], side[0]] * half * 1.25
+        middle = np.asarray(centre) + turn @ side * half
+        begin, end = ([*(middle + s * along), -0.004] for s in (-1, 1))
+        draw(method_named(), mesh, straight(begin, end, UP, 12))
+    return 4 * half**2 * SIZE[2]
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_a_square_plug_is_told_once_with_its_volume(seed):
+    rng = np.random.default_rng(seed)
+    mesh = held_at_its_sides()
+    register = PieceRegister(mesh)
+    centre, half = rng.uniform(-0.008, 0.008, 2), rng.uniform(0.008, 0.011)
+    volume = excise(mesh, centre, half, rng.uniform(0, np.pi))
+    (piece,) = register.find_new(mesh, mesh.rest)
+    assert piece.number == 1
+    assert piece.volume == pytest.approx(volume, rel=0.01)
+    assert piece.position == pytest.approx([*centre, SIZE[2] / 2], abs=2e-4)
+    assert register.find_new(mesh, mesh.rest) == []
+    draw(method_named(), mesh, straight([-0.028, 0.025, 0.006], [0.0, 0.025, 0.006], UP, 8))
+    assert register.find_new(mesh, mesh.rest) == []
+
+
+def test_the_smaller_half_of_a_piece_is_new():
+    mesh = held_at_its_sides()
+    register = PieceRegister(mesh)
+    excise(mesh, (0.0, 0.0), 0.0097, 0.0)
+    (whole,) = register.find_new(mesh, mesh.rest)
+    draw(method_named(), mesh, straight([0.005, -0.013, -0.004], [0.005, 0.013, -0.004], UP, 12))
+    (new,) = register.find_new(mesh, mesh.rest)
+    assert (whole.number, new.number) == (1, 2)
+    assert new.volume == pytest.approx(whole.volume * (0.0097 - 0.005) / 0.0194, rel=0.01)
+    assert new.position[0] > 0.005
+    both = pieces_of(mesh, mesh.rest)
+    assert sum(piece.volume for piece in both) == pytest.approx(whole.volume, rel=1e-9)
+
+
+def test_pieces_that_were_there_before_are_not_new():
+    mesh = held_at_its_sides()
+    excise(mesh, (0.0, 0.0), 0.01, 0.3)
+    assert PieceRegister(mesh).find_new(mesh, mesh.rest) == []
+
+
+def test_the_node_tells_a_piece_with_its_mass_once_the_blade_is_out():
+    mesh, told = held_at_its_sides(), []
+    node = SimpleNamespace(
+        _simulation=SimpleNamespace(mesh=mesh, material=SimpleNamespace(density=1060.0)),
+        _pieces=PieceRegister(mesh),
+        _looked_at=mesh.topology,
+        _free_pieces=SimpleNamespace(publish=told.append),
+    )
+    excise(mesh, (0.0, 0.0), 0.01, 0.3)
+    node._simulation.positions = mesh.rest + 0.1
+    for state in (ContactState.INSIDE, ContactState.NONE, ContactState.NONE):
+        TissueSimNode._tell_pieces(node, SimpleNamespace(step=7, state=state))
+        assert len(told) == (state != ContactState.INSIDE)
+    (message,) = told
+    assert (message.number, message.step, message.topology) == (1, 7, mesh.topology)
+    assert message.mass == pytest.approx(1060.0 * 4e-4 * SIZE[2], rel=0.01)
+    assert message.position == pytest.approx([0.1, 0.1, 0.1 + SIZE[2] / 2], abs=2e-4)
+
+
+def test_attached_tissue_and_unused_nodes_are_no_pieces():
+    corners = np.vstack([np.zeros(3), np.eye(3), [[5.0, 5.0, 5.0]]])
+    tissue = TetMesh(corners[:4], np.array([[0, 1, 2, 3]]), np.array([1, 0, 0, 0], np.uint8))
+    assert free_parts(tissue).tolist() == [0, 0, 0, 0]
+    tissue.fixed[:] = 0
+    assert free_parts(tissue).tolist() == [1, 1, 1, 1]

@@ -1,0 +1,386 @@
+"""The blade in the tissue: springs with a yield force that pays for the fracture work.
+
+Points of the edge in the simulation lag behind those of the device's edge. The springs between them
+load the tissue. A spring yields where it reaches the resistance of its piece of the edge,
+J l sin(edge, motion) + friction. The point then slips through the tissue, and the work of that slip
+is toughness times the swept area, whether the edge is drawn, pressed, sliced or turned. Along an
+existing cut, the blade pays friction alone (docs/method.md).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
+from cutting_trainer.tissue_sim.contact.fracture import (
+    BLADE_THICKNESS,
+    KNOTS,
+    CutStrips,
+    look_ahead,
+)
+from cutting_trainer.tissue_sim.mesh.locate import locate_points
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, tetrahedron_volumes
+
+_SAMPLES = 48
+_WHOLE = _SAMPLES / 2
+"""Points in the tissue at which their springs are as stiff as the coupling: half of the edge. Each
+has the same stiffness however many there are, else a spring that goes in or out would take energy
+from the others or give it to them."""
+_MIN_AREA = 1e-8
+_AHEAD = 1e-4
+"""[m] ahead of the edge, where the tissue is tested for a cut."""
+_MEDIAN_SAMPLES = 20000
+"""Elements in the sample for a median."""
+_MAX_SLIPS = 12
+_MAX_FREE_SLIP = BLADE_THICKNESS / 2
+"""[m] by which the edge slips along a cut before what is ahead of it is looked up again."""
+_SETTLED = 1e-6
+"""[m] of slip below which the edge counts as at rest."""
+_MIN_POINTS = 4
+"""Points in the tissue from which on they tell the direction of the edge."""
+_ONE_WAY = 0.3
+"""Share of the springs' forces in their sum from which on the tissue is loaded point by point."""
+_SHARES = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+_KNOTS = np.rint(np.linspace(0, _SAMPLES - 1, KNOTS)).astype(int)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The blade's edge before and after a step, in the deformed tissue [m], each shape (3,)."""
+
+    root_from: np.ndarray
+    tip_from: np.ndarray
+    root_to: np.ndarray
+    tip_to: np.ndarray
+
+    @property
+    def area(self) -> float:
+        """Area of the two triangles between the edges [m^2]."""
+        a, b, c, d = self.root_from, self.tip_from, self.tip_to, self.root_to
+        first = np.linalg.norm(np.cross(b - a, c - a))
+        return float(first + np.linalg.norm(np.cross(c - a, d - a))) / 2
+
+
+@dataclass(frozen=True)
+class Resistance:
+    """Resistance of the tissue to the blade.
+
+    Attributes:
+        threshold: contact force at which the blade enters [N] (thesis 5.1).
+        toughness: fracture toughness J [J/m^2].
+        friction: per immersed length [N/m].
+    """
+
+    threshold: float
+    toughness: float
+    friction: float
+
+    def forces(
+        self, piece: float, fresh: np.ndarray, edge: np.ndarray, ways: np.ndarray
+    ) -> np.ndarray:
+        """Return the largest force that each piece of the edge transmits [N], shape (p,).
+
+        Args:
+            piece: its length [m].
+            fresh: 1 where uncut tissue is ahead, else 0, shape (p,).
+            edge: unit vector along the edge, shape (3,).
+            ways: along which the pieces are pulled, shape (p, 3).
+        """
+        sizes = np.maximum(np.linalg.norm(ways, axis=1), 1e-300)
+        sines = np.linalg.norm(np.cross(ways, edge), axis=1) / sizes
+        return np.asarray(piece * (fresh * self.toughness * sines + self.friction))
+
+
+class Blade:
+    """The blade's edge in the tissue, from entry to exit.
+
+    Args:
+        resistance: of the tissue.
+        root, tip: the device's edge [m], shape (3,).
+        hint: a tetrahedron near the entry.
+
+    Attributes:
+        immersed: length of the edge in the tissue [m].
+        limit: largest force that the edge transmits as it is pulled, or would as it is moved [N].
+        force: of the edge on the tissue [N], shape (3,).
+        torque: the same about the tip of the device's edge [N m], shape (3,).
+        lag: mean distance of the edge from the device's, where it is in the tissue [m].
+        paid: work of cutting since entry, toughness times swept area [J].
+        rubbed: work of friction since entry [J].
+    """
+
+    def __init__(
+        self, resistance: Resistance, root: np.ndarray, tip: np.ndarray, hint: int
+    ) -> None:
+        self._resistance = resistance
+        self._device = np.array([root, tip])
+        self._points = self._device_points()
+        self._moved = np.zeros((_SAMPLES, 3))
+        self._tip, self._edge = tip.copy(), root - tip
+        self._cut_tip, self._cut_edge = tip.copy(), root - tip
+        self._hint = hint
+        self._before: tuple[np.ndarray, np.ndarray, np.ndarray | None] = (
+            np.zeros(3),
+            self._cut_edge,
+            None,
+        )
+        self._inside = np.zeros(_SAMPLES, bool)
+        self._corners = np.zeros((0, 4), np.int64)
+        self._parts = np.zeros((0, 4))
+        self._fracture = CutStrips()
+        self._element = 0.0
+        self._back: np.ndarray | None = None
+        self._failed = self._set_back = False
+        self.immersed = self.limit = self.lag = self.paid = self.rubbed = 0.0
+        self.force, self.torque = np.zeros(3), np.zeros(3)
+
+    @property
+    def device(self) -> np.ndarray:
+        """Root and tip of the device's edge [m], shape (2, 3)."""
+        return self._device
+
+    def kept(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the state for `restore`: nothing in it is changed in place."""
+        return dict(vars(self)), dict(vars(self._fracture))
+
+    def restore(self, kept: tuple[dict[str, Any], dict[str, Any]]) -> None:
+        """Return to a state of `kept`."""
+        vars(self).update(kept[0])
+        vars(self._fracture).update(kept[1])
+
+    def carry(self, positions: np.ndarray) -> None:
+        """Move the edge with the tissue.
+
+        Args:
+            positions: nodes now, of the same mesh as at the last `follow` [m], shape (n, 3).
+        """
+        if not self._inside.any():
+            return
+        before, points = self._points[self._inside], self._points.copy()
+        points[self._inside] = np.einsum('ij,ijk->ik', self._parts, positions[self._corners])
+        self._points = points
+        at, along = _line(_SHARES[self._inside], points[self._inside] - before)
+        self._cut_tip, self._cut_edge = self._cut_tip + at, self._cut_edge + along
+        self._fracture.carry(at + along * float(_SHARES[self._inside].mean()))
+
+    def follow(
+        self,
+        mesh: TetMesh,
+        positions: np.ndarray,
+        device: np.ndarray,
+        stiffness: float,
+        opened: np.ndarray,
+    ) -> None:
+        """Let the edge slip after the device's edge.
+
+        Args:
+            mesh: the tissue.
+            positions: current nodes [m], shape (n, 3).
+            device: root and tip of the device's edge [m], shape (2, 3).
+            stiffness: of the coupling [N/m].
+            opened: triangles of the surface that cuts have opened, shape (c, 3).
+        """
+        if self._element == 0.0:
+            some = mesh.tetrahedra[:: 1 + len(mesh.tetrahedra) // _MEDIAN_SAMPLES]
+            volumes = tetrahedron_volumes(mesh.rest, some)
+            self._element = 2 * float(np.cbrt(np.median(volumes)))
+        before = self._device_points()
+        self._device = device.copy()
+        self._moved = self._device_points() - before
+        self._immerse(mesh, positions)
+        cuts = np.zeros((0, 3, 3))
+        if not self._inside.any():
+            self._fracture.forget()
+        else:
+            ends = np.concatenate([self._points, self._device_points()])[np.tile(self._inside, 2)]
+            cuts = self._fracture.near(positions[opened], ends)
+            for _ in range(_MAX_SLIPS):
+                if not self._slip(stiffness, cuts):
+                    break
+                self._immerse(mesh, positions)
+                if not self._inside.any():
+                    break
+        self._settle(stiffness, cuts)
+
+    def let_go(self) -> None:
+        """Let the edge follow the device without force: nothing is known of the tool."""
+        self._inside = np.zeros(_SAMPLES, bool)
+        self._corners, self._parts = np.zeros((0, 4), np.int64), np.zeros((0, 4))
+        self._fracture.forget()
+        self._settle(0.0, np.zeros((0, 3, 3)))
+
+    def spring(
+        self, positions: np.ndarray, ahead: np.ndarray, share: float, stiffness: float
+    ) -> Coupling:
+        """Return the spring until the next `follow`; free where no edge is in the tissue.
+
+        Args:
+            positions: current nodes [m], shape (n, 3).
+            ahead: root and tip of the device's edge at the end of the frame [m], shape (2, 3).
+            share: of the frame that has passed.
+            stiffness: of the coupling [N/m].
+        """
+        count = len(self._corners)
+        if count == 0:
+            return Coupling()
+        forces = self._stretch() @ self.force
+        loads = np.full(count, 1 / count)
+        if self.force @ self.force > 0.0 and forces.sum() > _ONE_WAY * np.abs(forces).sum():
+            loads = forces / forces.sum()
+        nodes, slots = np.unique(self._corners, return_inverse=True)
+        weights = np.bincount(slots.ravel(), (loads[:, None] * self._parts).ravel(), len(nodes))
+        middle = float(_SHARES[self._inside].mean())
+        moved = (1 - middle) * (ahead[1] - self._device[1]) + middle * (ahead[0] - self._device[0])
+        rate = moved / (1 - share) if share < 1 else np.zeros(3)
+        whole = stiffness * count / _WHOLE
+        at = weights @ positions[nodes] + self.force / whole
+        return Coupling(
+            mode=HOLD,
+            nodes=nodes.astype(np.int64),
+            weights=weights,
+            start=at - share * rate,
+            end=at + moved,
+            stiffness=whole,
+            limit=self.limit,
+        )
+
+    def _device_points(self) -> np.ndarray:
+        root, tip = self._device
+        return np.asarray(tip + _SHARES[:, None] * (root - tip))
+
+    def _stretch(self) -> np.ndarray:
+        """Return from the edge to the device's edge at each point in the tissue [m], (p, 3)."""
+        return np.asarray((self._device_points() - self._points)[self._inside])
+
+    def _immerse(self, mesh: TetMesh, positions: np.ndarray) -> None:
+        """Find the points in the tissue. The others follow the device."""
+        points, device = self._points, self._device_points()
+        points = np.where(self._inside[:, None], points, device)
+        for _ in range(2):
+            found = np.empty(_SAMPLES, np.int64)
+            parts = np.empty((_SAMPLES, 4))
+            locate_points(
+                positions, mesh.tetrahedra, mesh.neighbors, points, self._hint, found, parts
+            )
+            self._inside = found >= 0
+            left = ~self._inside & (points != device).any(axis=1)
+            if not left.any():
+                break
+            points = np.where(left[:, None], device, points)
+        self._points = points
+        self._corners = mesh.tetrahedra[found[self._inside]].astype(np.int64)
+        self._parts = parts[self._inside]
+        if len(self._corners):
+            self._hint = int(found[self._inside][0])
+
+    def _knots(self) -> np.ndarray:
+        """Return some points of the edge; those outside lag as much as the nearest inside [m]."""
+        shares, stretch = _SHARES[self._inside], self._stretch()
+        lag = np.column_stack([np.interp(_SHARES[_KNOTS], shares, part) for part in stretch.T])
+        return np.asarray(self._device_points()[_KNOTS] - lag)
+
+    def _piece(self) -> float:
+        """Return the length of the edge that a point stands for [m]."""
+        return float(np.linalg.norm(self._device[0] - self._device[1])) / _SAMPLES
+
+    def _direction(self) -> np.ndarray:
+        edge = self._device[0] - self._device[1]
+        return np.asarray(edge / np.linalg.norm(edge))
+
+    def _slip(self, stiffness: float, cuts: np.ndarray) -> bool:
+        """Let the points slip whose springs exceed the resistance; return whether any did."""
+        ways = self._stretch()
+        fresh = np.empty(len(ways))
+        look_ahead(self._points[self._inside], ways, cuts, BLADE_THICKNESS / 2, _AHEAD, fresh)
+        unit, piece, each = self._direction(), self._piece(), stiffness / _WHOLE
+        sizes = np.maximum(np.linalg.norm(ways, axis=1), 1e-300)
+        limits = self._resistance.forces(piece, fresh, unit, ways)
+        slid = np.maximum(sizes - limits / each, 0.0)
+        slid = np.where(fresh == 0, np.minimum(slid, _MAX_FREE_SLIP), slid)
+        if slid.max() < _SETTLED:
+            return False
+        ways *= (slid / sizes)[:, None]
+        rub = piece * self._resistance.friction * float(slid.sum())
+        self.paid += float(limits @ slid) - rub
+        self.rubbed += rub
+        before = self._knots()
+        self._points = self._points.copy()
+        self._points[self._inside] += ways
+        if (slid[fresh == 1] > _SETTLED).any():
+            self._fracture.add(before, self._knots())
+        else:
+            self._fracture.leave()
+        return True
+
+    def _settle(self, stiffness: float, cuts: np.ndarray) -> None:
+        """Update what others see: force, torque, limit, and the edge as a line."""
+        self.force, self.torque, self.limit, self.lag = np.zeros(3), np.zeros(3), 0.0, 0.0
+        count = len(self._corners)
+        self.immersed = count * self._piece()
+        root, self._tip = self._device
+        self._edge = root - self._tip
+        if count == 0:
+            return
+        stretch, shares = self._stretch(), _SHARES[self._inside]
+        pulls = stiffness / _WHOLE * stretch
+        self.force = pulls.sum(axis=0)
+        self.torque = np.cross(shares[:, None] * self._edge, pulls).sum(axis=0)
+        self.lag = float(np.linalg.norm(stretch.mean(axis=0)))
+        # As it is pulled now, or will be if the device moves on.
+        for ways in (stretch.copy(), self._moved[self._inside]):
+            fresh = np.empty(count)
+            look_ahead(self._points[self._inside], ways, cuts, BLADE_THICKNESS / 2, _AHEAD, fresh)
+            limits = self._resistance.forces(self._piece(), fresh, self._direction(), ways)
+            self.limit = max(self.limit, float(limits.sum()))
+        if count < _MIN_POINTS:
+            self._tip = self._tip - stretch.mean(axis=0)
+        else:
+            at, along = _line(shares, stretch)
+            self._tip, self._edge = self._tip - at, self._edge - along
+
+    def sweep(self) -> Sweep | None:
+        """Return the sweep of the edge since the last `confirm_sweep`; None if it is negligible."""
+        sweep = Sweep(
+            self._cut_tip + self._cut_edge, self._cut_tip, self._tip + self._edge, self._tip
+        )
+        return sweep if sweep.area > _MIN_AREA else None
+
+    def confirm_sweep(self) -> None:
+        """Start the next sweep from the present edge."""
+        self._before = (self._cut_tip - self._tip, self._cut_edge, self._back)
+        self._cut_tip = self._tip.copy()
+        self._cut_edge = self._edge.copy()
+        behind = self._fracture.behind(self._element)
+        self._back = None if behind is None else behind - self._cut_tip
+        self._set_back &= self._failed
+        self._failed = False
+
+    def retry_sweep(self) -> None:
+        """Start the next sweep where the last one, which was not cut, started, or an element
+        earlier.
+
+        The cutting service may have lost the stroke, and with it the element around the edge, which
+        is divided only after the edge has left it. Repeated failures extend the sweep only once.
+        """
+        offset, self._cut_edge, self._back = self._before
+        self._cut_tip = self._cut_tip + offset
+        if self._back is not None and not self._set_back:
+            root, tip = self._back
+            self._cut_tip, self._cut_edge = self._cut_tip + tip, root - tip
+            self._set_back = True
+        self._failed = True
+
+
+def _line(shares: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the line a + s b nearest to values at shares s; level where they are too few.
+
+    Args:
+        shares: shape (p,).
+        values: shape (p, 3).
+    """
+    mean, arms = values.mean(axis=0), shares - shares.mean()
+    if len(shares) < _MIN_POINTS:
+        return mean, np.zeros(3)
+    along = arms @ values / float(arms @ arms)
+    return mean - float(shares.mean()) * along, along

@@ -1,0 +1,313 @@
+"""Coupling of tool and tissue: a spring to a material point, evaluated in every substep.
+
+A force held constant for a 33 ms frame makes the loop of coupling spring and tissue diverge as soon
+as the spring is stiffer than the tissue. The simulation therefore gets the spring, not the force:
+its tissue end moves with the nodes.
+
+Against a footprint the spring has a part that the mesh cannot see in series: the settlement under
+the tool, hertz * force^(2/3) (1 + bend * force^(2/3)), less the part `seen` by the mesh. It is
+never stiffer than the coupling spring alone.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from cutting_trainer.node_common.kernels import inner, kernel
+
+FREE = 0
+PUSH = 1
+HOLD = 2
+
+
+class Spring(NamedTuple):
+    """A coupling as operand of the kernels.
+
+    Attributes:
+        mode, nodes, weights, normal: see `Coupling`.
+        ends: position of the tool's end at the start and end of the frame [m], shape (2, 3).
+        anchor: rest position of the tissue's end [m], shape (3,).
+        scalars: see `Coupling.scalars`.
+    """
+
+    mode: int
+    nodes: np.ndarray
+    weights: np.ndarray
+    normal: np.ndarray
+    ends: np.ndarray
+    anchor: np.ndarray
+    scalars: np.ndarray
+
+
+@dataclass
+class Coupling:
+    """A spring between the tool and the weighted mean of some nodes.
+
+    Attributes:
+        mode: FREE (no spring), PUSH (along `normal`, never pulls, and across it up to `share`) or
+            HOLD (all directions).
+        nodes: shape (c,).
+        weights: sum 1, shape (c,).
+        start, end: where the tool's end of the spring is at the start and at the end of the frame
+            [m], shape (3,).
+        normal: outward unit normal (PUSH), shape (3,).
+        stiffness: [N/m].
+        limit: largest force [N]; the spring yields above it.
+        hertz: settlement under the tool, by force^(2/3) (PUSH); 0: none in series [m N^(-2/3)].
+        bend: its relative growth, by force^(2/3) [N^(-2/3)].
+        seen: compliance of the mesh that this settlement replaces [m/N].
+        most: force from which on the settlement grows in proportion [N].
+        reach: radius of the disc around the touched point that is under load [m]; 0: a triangle.
+        share: largest tangential force, relative to the normal force (PUSH): without friction, of
+            the tissue that moves under the tool within a frame; else the coefficient of friction.
+    """
+
+    mode: int = FREE
+    nodes: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    weights: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    start: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    end: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    normal: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    stiffness: float = 0.0
+    limit: float = np.inf
+    hertz: float = 0.0
+    bend: float = 0.0
+    seen: float = 0.0
+    most: float = np.inf
+    reach: float = 0.0
+    share: float = 1.0
+
+    @cached_property
+    def scalars(self) -> np.ndarray:
+        """Constants of the law at its first use, shape (9,).
+
+        Stiffness [N/m], largest force [N]; of the settlement `hertz`, `bend`, `seen`; force [N],
+        stretch [m] and stiffness [N/m] from which on the law is straight; `share`.
+        """
+        law = np.zeros(9)
+        law[:5] = self.stiffness, self.limit, self.hertz, self.bend, self.seen
+        law[8] = self.share
+        if self.hertz > 0.0:
+            steepest = (2 * self.hertz / (3 * self.seen)) ** 3 if self.seen > 0.0 else np.inf
+            law[5] = min(steepest, self.most)
+            if np.isfinite(law[5]):
+                root = np.cbrt(law[5])
+                yields = self.hertz * (2 + 4 * self.bend * root**2) / (3 * root) - self.seen
+                law[6] = self._stretch_at(law[5])
+                law[7] = 1 / (1 / self.stiffness + max(yields, 0.0))
+        return law
+
+    def stretch_at(self, force: float) -> float:
+        """Return the normal stretch at a normal force [m]."""
+        law = self.scalars
+        if force > law[5] and self.hertz > 0.0:
+            return float(law[6] + (force - law[5]) / law[7])
+        return self._stretch_at(force)
+
+    def _stretch_at(self, force: float) -> float:
+        """Return the normal stretch in the curved part of the law [m]."""
+        part = np.cbrt(force) ** 2
+        settled = self.hertz * part * (1 + self.bend * part)
+        return float(force * (1 / self.stiffness - self.seen) + settled)
+
+    def pushed(self, stretch: float) -> float:
+        """Return the normal force at a normal stretch, 0 or more [N]."""
+        return float(normal_force(stretch, self.scalars))
+
+    def point(self, positions: np.ndarray) -> np.ndarray:
+        """Return the tissue's end of the spring [m], shape (3,); `positions` has shape (n, 3)."""
+        return self.weights @ positions[self.nodes]
+
+    def spring(self, rest: np.ndarray) -> Spring:
+        """Return the operand of the kernels for rest positions [m], shape (n, 3)."""
+        return Spring(
+            self.mode,
+            self.nodes,
+            self.weights,
+            self.normal,
+            np.array([self.start, self.end]),
+            self.weights @ rest[self.nodes],
+            self.scalars,
+        )
+
+    def force(self, positions: np.ndarray, share: float = 1.0) -> np.ndarray:
+        """Return the force on the tissue after a share of the frame [N], shape (3,)."""
+        out = np.zeros(3)
+        stretch = self.start + share * (self.end - self.start) - self.point(positions)
+        spring_force(self.mode, stretch, self.normal, self.scalars, out)
+        return out
+
+
+class Tool(Protocol):
+    """The tool within a frame: each part of the frame has its own spring.
+
+    Attributes:
+        parts: of a frame.
+    """
+
+    parts: int
+
+    def restart(self) -> Coupling:
+        """Return to the begin of the frame, and the spring of its first part."""
+
+    def after(self, share: float, positions: np.ndarray) -> Coupling:
+        """Return the spring of the next part.
+
+        Args:
+            share: of the frame that has passed.
+            positions: nodes now [m], shape (n, 3).
+        """
+
+
+@kernel
+def normal_force(stretch, scalars):
+    """Return the force of a spring against a footprint at a normal stretch [N].
+
+    Args:
+        stretch: 0 or more [m].
+        scalars: see `Coupling.scalars`, with `hertz` above 0.
+    """
+    if stretch <= 0.0:
+        return 0.0
+    hertz, bend, straight = scalars[2], scalars[3], scalars[5]
+    if stretch >= scalars[6] and np.isfinite(straight):
+        return straight + scalars[7] * (stretch - scalars[6])
+    # Newton's method for the cube root of the force, kept between two bounds.
+    linear, low, high = 1.0 / scalars[0] - scalars[4], 0.0, np.sqrt(stretch / hertz)
+    if linear < 0.0:
+        high = np.cbrt(straight)
+    root = min(np.sqrt(stretch / hertz), high)
+    for _ in range(60):
+        square = root * root
+        value = linear * square * root + hertz * square * (1.0 + bend * square) - stretch
+        if value > 0.0:
+            high = root
+        else:
+            low = root
+        slope = root * (3.0 * linear * root + hertz * (2.0 + 4.0 * bend * square))
+        after = root - value / slope
+        if not low < after < high:
+            after = 0.5 * (low + high)
+        if abs(after - root) <= 1e-13 * root:
+            break
+        root = after
+    return root * root * root
+
+
+@kernel
+def spring_force(mode, stretch, normal, scalars, out):
+    """Compute the force of the spring on the tissue.
+
+    Args:
+        mode: FREE, PUSH or HOLD.
+        stretch: tool's end minus tissue's end [m], shape (3,).
+        normal: outward unit normal, shape (3,).
+        scalars: see `Coupling.scalars`.
+        out: force [N], shape (3,).
+    """
+    stiffness, limit = scalars[0], scalars[1]
+    out[:] = 0.0
+    if mode == PUSH:
+        along = stretch[0] * normal[0] + stretch[1] * normal[1] + stretch[2] * normal[2]
+        if along >= 0.0:
+            return
+        across = 0.0
+        for i in range(3):
+            out[i] = stretch[i] - along * normal[i]
+            across += out[i] * out[i]
+        # Continuous where the contact opens: an abrupt release would add energy.
+        if scalars[2] > 0.0:
+            pushed = normal_force(-along, scalars)
+            most = scalars[8] * pushed
+            grip = min(stiffness, most / max(np.sqrt(across), 1e-300))
+            for i in range(3):
+                out[i] = grip * out[i] - pushed * normal[i]
+            return
+        grip = min(1.0, -scalars[8] * along / max(np.sqrt(across), 1e-300))
+        for i in range(3):
+            out[i] = stiffness * (along * normal[i] + grip * out[i])
+    elif mode == HOLD:
+        length = np.sqrt(stretch[0] ** 2 + stretch[1] ** 2 + stretch[2] ** 2)
+        size = stiffness
+        if stiffness * length > limit:
+            size = limit / length
+        for i in range(3):
+            out[i] = size * stretch[i]
+
+
+@inner
+def spring_stretch(spring, at, u, stretch):
+    """Compute the tool's end minus the tissue's end.
+
+    Args:
+        spring: see `Spring`.
+        at: elapsed share of the frame.
+        u: displacement by coordinate [m], shape (3 n,).
+        stretch: output [m], shape (3,).
+    """
+    ends = spring.ends
+    for i in range(3):
+        stretch[i] = ends[0, i] + at * (ends[1, i] - ends[0, i]) - spring.anchor[i]
+        for c in range(spring.nodes.shape[0]):
+            stretch[i] -= spring.weights[c] * u[3 * spring.nodes[c] + i]
+
+
+@inner
+def force_of_spring(spring, at, u, out):
+    """Compute the force of the spring on the tissue.
+
+    Args:
+        spring: see `Spring`.
+        at: elapsed share of the frame.
+        u: displacement by coordinate [m], shape (3 n,).
+        out: [N], shape (3,).
+    """
+    stretch = np.empty(3)
+    spring_stretch(spring, at, u, stretch)
+    spring_force(spring.mode, stretch, spring.normal, spring.scalars, out)
+
+
+@inner
+def subtract_spring(spring, at, u, f, out):
+    """Subtract the spring's force on the tissue from the elastic force.
+
+    Args:
+        f: elastic force [N], shape (3 n,).
+        spring, at, u, out: as for `force_of_spring`.
+    """
+    force_of_spring(spring, at, u, out)
+    for c in range(spring.nodes.shape[0]):
+        for i in range(3):
+            f[3 * spring.nodes[c] + i] -= spring.weights[c] * out[i]
+
+
+@inner
+def spring_work(spring, force, u, last):
+    """Return the work on the tissue since the last call, by the trapezoidal rule [J].
+
+    Args:
+        spring: see `Spring`.
+        force: on the tissue now [N], shape (3,).
+        u: displacement by coordinate [m], shape (3 n,).
+        last: force [N] and position [m] of the tissue's end at the last call; updated, shape (2,
+            3).
+    """
+    work = 0.0
+    for i in range(3):
+        place = 0.0
+        for c in range(spring.nodes.shape[0]):
+            place += spring.weights[c] * u[3 * spring.nodes[c] + i]
+        work += 0.5 * (force[i] + last[0, i]) * (place - last[1, i])
+        last[0, i] = force[i]
+        last[1, i] = place
+    return work
+
+
+@inner
+def start_of_work(spring, u, last):
+    """Initialise `last` with the present position and zero force; return 0 J."""
+    force = np.zeros(3)
+    spring_work(spring, force, u, last)
+    return 0.0

@@ -1,0 +1,43 @@
+"""Constants of linear isotropic elasticity for the kernels."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Material:
+    """A homogeneous isotropic tissue.
+
+    Attributes:
+        youngs_modulus: E [Pa].
+        poissons_ratio: nu, below 0.5.
+        density: rho [kg/m^3].
+        alpha: mass-proportional damping [1/s] (thesis eq. 7.3).
+        beta: stiffness-proportional damping [s] (thesis eq. 7.3; its unit is seconds).
+        stiffening: b of the law exp(b x) of the model `stiffening`, 0: neo-Hookean.
+        prony: share g of the shear modulus that relaxes, and its time [s], by term: shear has
+            G(t) = G (1 - sum of g (1 - exp(-t / tau))). E is that of the first moment, t = 0.
+    """
+
+    youngs_modulus: float
+    poissons_ratio: float
+    density: float
+    alpha: float = 0.0
+    beta: float = 0.0
+    stiffening: float = 0.0
+    prony: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def lame_lambda(self) -> float:
+        """First Lame coefficient [Pa] (thesis eq. 7.1)."""
+        nu = self.poissons_ratio
+        return nu * self.youngs_modulus / ((1 - 2 * nu) * (1 + nu))
+
+    @property
+    def lame_mu(self) -> float:
+        """Shear modulus [Pa] (thesis eq. 7.2)."""
+        return self.youngs_modulus / (2 * (1 + self.poissons_ratio))
+
+    @property
+    def plane_modulus(self) -> float:
+        """Modulus of contact, E / (1 - nu^2) [Pa]."""
+        return self.youngs_modulus / (1 - self.poissons_ratio**2)

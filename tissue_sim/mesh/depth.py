@@ -1,0 +1,37 @@
+"""Depth of points below the surface of the tissue at rest."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, locate_points
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+
+Floats = NDArray[np.float64]
+
+
+class SurfaceDepth:
+    """Computes depths below the free surface of a tissue.
+
+    Args:
+        tissue: replica; cut faces do not count as surface.
+    """
+
+    def __init__(self, tissue: MeshReplica) -> None:
+        self._mesh = mesh = TetMesh(tissue.rest, tissue.tetrahedra, tissue.fixed)
+        outer = np.array(tissue.triangles[tissue.triangle_kind == 0], mesh.triangles.dtype)
+        self._free = outer[~(mesh.fixed[outer] == 1).all(axis=1)]
+
+    def depths(self, points: Floats) -> Floats:
+        """Return the depth of points below the surface at rest, 0 outside [m], shape (p,).
+
+        Args:
+            points: [m], shape (p, 3).
+        """
+        mesh, points = self._mesh, np.ascontiguousarray(points)
+        found, weights = np.empty(len(points), np.int64), np.empty((len(points), 4))
+        locate_points(mesh.rest, mesh.tetrahedra, mesh.neighbors, points, 0, found, weights)
+        out = np.zeros(len(points))
+        for i in np.flatnonzero(found >= 0):
+            out[i] = distance_to_triangles(points[i], mesh.rest, self._free)
+        return out

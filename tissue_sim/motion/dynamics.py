@@ -1,0 +1,501 @@
+"""Dynamics of the tissue by frame: model, integrator, step, active region, divergence detector."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling, Spring, Tool
+from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
+from cutting_trainer.tissue_sim.mesh.adjacency import spans_of
+from cutting_trainer.tissue_sim.mesh.strain import Strain
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import (
+    TetMesh,
+    TopologyDelta,
+    Touched,
+    carried_over,
+    grown,
+)
+from cutting_trainer.tissue_sim.motion.active_region import (
+    ActiveRegion,
+    ActiveSettings,
+    Region,
+)
+from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
+from cutting_trainer.tissue_sim.motion.elastic_state import ElasticState
+from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
+from cutting_trainer.tissue_sim.motion.loads import Loads
+from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
+from cutting_trainer.tissue_sim.motion.stiffened_mass import SUBSTEPS_BETWEEN, StiffenedMass
+
+_AT_REST = 1e-9
+"""[m/s] below which an untouched tissue is at rest after `_STILL_FRAMES`."""
+_STILL_FRAMES = 10
+_FINER, _FINEST = 4, 16
+"""Refinement of the steps in the next attempt, and its limit. A frame then does no more work than
+21 frames, though frame after frame should need shorter steps; with explicit steps of a model
+without rotations, no more than 5: its bound holds in any shape, and steps shorter than a quarter do
+not help."""
+_CAUTIOUS_FRAMES = 30
+
+
+@dataclass(frozen=True)
+class TimeStepping:
+    """Time stepping of frames.
+
+    Attributes:
+        integrator: name.
+        rate: frames a second [Hz].
+        safety: ratio of step to stable step.
+        min_substeps, max_substeps: of a frame; when the largest number does not suffice the frame
+            simulates less time than it lasts.
+        frequency_growth: largest growth of the highest frequency by cuts before small nodes are
+            integrated with more mass (see `FrequencyBound`); infinite: no limit.
+    """
+
+    integrator: IntegratorName = 'rk4'
+    rate: float = 30.0
+    safety: float = 0.8
+    min_substeps: int = 1
+    max_substeps: int = 200
+    frequency_growth: float = 3.0
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """Motion of one frame.
+
+    Attributes:
+        elastic_force: against the displacement, less weight and viscous relief [N], shape (n, 3).
+        kinetic_energy, elastic_energy: [J]; the latter with that of weight and viscosity.
+        substeps: number of substeps.
+        slow_motion: simulated time over frame time.
+        trouble: the error; empty: none.
+        diverged: shorter steps did not help, and the frame was rolled back.
+        strain: of a model with a law.
+    """
+
+    elastic_force: np.ndarray
+    kinetic_energy: float
+    elastic_energy: float
+    substeps: int
+    slow_motion: float
+    trouble: str = ''
+    diverged: bool = False
+    strain: Strain | None = None
+
+
+class Dynamics:
+    """Displacement and velocity of the tissue, and their integration.
+
+    Args:
+        mesh: the tissue; changed by `apply_cut` only.
+        material: its constants.
+        model: its elasticity.
+        stepping: time stepping.
+        active: selection of the moving nodes.
+        gravity: acceleration [m/s^2].
+
+    Raises:
+        ValueError: the integrator has no stable step with this damping.
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        material: Material,
+        model: ModelName = 'linear',
+        stepping: TimeStepping | None = None,
+        active: ActiveSettings | None = None,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.mesh = mesh
+        self.material = material
+        self.model = ElasticModel(mesh, material, model)
+        loaded = bool(material.prony) or any(gravity)
+        self.loads = Loads(self.model, gravity) if loaded else None
+        self.stepping = stepping or TimeStepping()
+        self._frame_time = 1.0 / self.stepping.rate
+        self._integrator = Integrator(self.stepping.integrator, material.alpha, material.beta)
+        size = 3 * mesh.node_count
+        self._u, self._v = np.zeros(size), np.zeros(size)
+        self._inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / self.model.mass), 3)
+        self._inertia = self.model.mass.copy()
+        self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
+        self._uncut = self._frequency.omega
+        self._stiffened: StiffenedMass | None = None
+        if self.model.lawful:
+            growth = self.stepping.frequency_growth
+            self._stiffened = StiffenedMass(self.model, self._uncut, mesh.fixed == 0, growth)
+        self._bounds: dict[float, float] = {}
+        self._still = 0
+        self._elastic = ElasticState(self.model)
+        self._touched: list[np.ndarray] = []
+        self._caution = 1
+        self._cautious = 0
+        self._detector = DivergenceDetector(mesh, material.youngs_modulus)
+        self._active = ActiveRegion(
+            self.model,
+            active or ActiveSettings(),
+            implicit=self.stepping.integrator == 'implicit',
+        )
+        if self.bound() == 0.0:
+            raise ValueError(
+                f'{self.stepping.integrator} has no stable step with damping alpha '
+                f'{material.alpha:g} 1/s and beta {material.beta:g} s: damp the tissue, or take '
+                'another integrator'
+            )
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """Displacements [m], shape (n, 3); a view."""
+        return self._u[: 3 * self.mesh.node_count].reshape(-1, 3)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities [m/s], shape (n, 3); a view."""
+        return self._v[: 3 * self.mesh.node_count].reshape(-1, 3)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Current node positions [m], shape (n, 3); a new array."""
+        return self.mesh.rest + self.displacement
+
+    @property
+    def omega(self) -> float:
+        """Bound of the highest frequency, for the step [rad/s]."""
+        bound = self._frequency.omega
+        return bound if self._stiffened is None else max(self._stiffened.omega, bound)
+
+    @property
+    def inverse_mass(self) -> np.ndarray:
+        """Inverse mass by coordinate, 0 where fixed [1/kg], shape (3 n,); a view."""
+        return self._inverse[: 3 * self.mesh.node_count]
+
+    @property
+    def active_nodes(self) -> int:
+        """Number of moving nodes."""
+        return self._active.count
+
+    @property
+    def held_to(self) -> np.ndarray | None:
+        """The only nodes that can move, sorted, shape (a,); None: all that are not fixed."""
+        return self._active.held_to
+
+    @property
+    def inverted(self) -> int:
+        """Number of inverted tetrahedra."""
+        return self._detector.inverted(self.displacement)
+
+    def stretch(self, stretch: np.ndarray) -> None:
+        """Stretch the fixed nodes, and move the others to equilibrium.
+
+        Args:
+            stretch: along x, y and z (0.05: by 5 %), shape (3,).
+        """
+        fixed = self.mesh.fixed == 1
+        middle = self.mesh.rest[fixed].mean(axis=0)
+        u = self.displacement
+        u[:] = (self.mesh.rest - middle) * stretch
+        first = 0.0
+        for _ in range(50 if self.model.rotating else 1):
+            residual = -self.model.force(u)
+            size = float(np.linalg.norm(residual[~fixed]))
+            first = first or size
+            if size < 1e-10 * first:
+                break
+            u[~fixed] += solve_static(self.model, self.inverse_mass > 0, residual)[~fixed]
+        self.restart()
+
+    def settle(self) -> None:
+        """Move to the shape at rest under weight, relaxed, with the fixed nodes where they are.
+
+        Raises:
+            MeshError: there is none.
+        """
+        if self.loads is not None:
+            self.resume(self.loads.at_rest(self.displacement.copy()))
+
+    def bound(self, coupling: Coupling | None = None) -> float:
+        """Return the largest stable step [s], the coupling spring's stiffness included."""
+        square = self.omega**2
+        if coupling is not None and coupling.mode != FREE:
+            inverse = self.inverse_mass[3 * coupling.nodes]
+            square += coupling.stiffness * float(np.sum(coupling.weights**2 * inverse))
+        # Rounded up, so that only few different bounds are computed.
+        omega = 1.01 ** np.ceil(np.log(np.sqrt(square)) / np.log(1.01))
+        if omega not in self._bounds:
+            m = self.material
+            self._bounds[omega] = step_bound(self.stepping.integrator, omega, m.alpha, m.beta)
+        return self._bounds[omega]
+
+    def _substeps(self, coupling: Coupling) -> tuple[int, float]:
+        dt = self.stepping.safety * self.bound(coupling) / self._caution
+        substeps = max(int(np.ceil(self._frame_time / dt)), self.stepping.min_substeps)
+        substeps = max(substeps, self._caution)
+        if substeps > self.stepping.max_substeps * self._caution:
+            return self.stepping.max_substeps * self._caution, dt
+        return substeps, self._frame_time / substeps
+
+    def advance(self, coupling: Coupling, tool: Tool | None = None) -> FrameMotion:
+        """Integrate a frame; after divergence, retry it with shorter steps.
+
+        An unattached piece may be pushed away without end. It stops at a distance of the tissue's
+        length.
+
+        Args:
+            coupling: the tool's spring.
+            tool: gives other springs within the frame; None: the spring stays.
+        """
+        if self.loads is not None:
+            self.loads.refresh(self._u[: 3 * self.mesh.node_count])
+        if self._touched:
+            self._begin_account()  # a pass over the tissue, which must not slow down a batch
+        self._frequency.refine()
+        if self._cautious:
+            self._cautious -= 1
+            self._caution = self._caution if self._cautious else 1
+        if self._stiffened is not None:
+            flat = self._u[: 3 * self.mesh.node_count]
+            self._stiffened.begin(flat, self._frequency.omega, self.inverse_mass)
+        substeps, dt = self._substeps(coupling)
+        before = (self._u.copy(), self._v.copy())
+        relieved = None if self.loads is None else self.loads.kept()
+        trouble = ''
+        while True:
+            work = self._integrate(coupling, dt, substeps, tool)
+            motion = self._motion(dt, substeps, trouble)
+            energy = motion.kinetic_energy + motion.elastic_energy
+            found = self._detector.diagnose(self.displacement, energy, work)
+            if not found:
+                return motion
+            if self.loads is not None:
+                self.loads.restore(relieved)
+            if self._hold_lost(*before):
+                trouble = f'{found}: a piece that nothing held, which stays there from now on'
+                continue
+            trouble = trouble or f'{found}: {self._cause(coupling, dt)}'
+            self._u, self._v = before[0].copy(), before[1].copy()
+            self.model.restart_rotations(self.displacement)
+            known = not self.model.rotating and self.stepping.integrator != 'implicit'
+            if self._caution * _FINER > (_FINER if known else _FINEST):
+                break
+            self._touched.append(np.arange(self.mesh.node_count))
+            self._caution *= _FINER
+            self._cautious = _CAUTIOUS_FRAMES
+            substeps, dt = substeps * _FINER, dt / _FINER
+        self._v[:] = 0.0
+        self._caution = 1
+        force, elastic = self._elastic.whole(self.displacement)
+        self._detector.open(elastic + self._load_energy())
+        return FrameMotion(np.zeros_like(force), 0.0, 0.0, substeps, 0.0, trouble, diverged=True)
+
+    def _hold_lost(self, u: np.ndarray, v: np.ndarray) -> bool:
+        """Return to the start of the frame, with lost pieces held.
+
+        Args:
+            u, v: displacement [m] and velocity [m/s] at the start; v is changed.
+
+        Returns:
+            Whether there were any.
+        """
+        n = self.mesh.node_count
+        lost = self._detector.lost(u[: 3 * n].reshape(-1, 3), self.displacement)
+        if len(lost) == 0:
+            return False
+        v[: 3 * n].reshape(-1, 3)[lost] = 0.0
+        self.inverse_mass.reshape(-1, 3)[lost] = 0.0
+        self._u, self._v = u.copy(), v.copy()
+        self._touched.append(np.arange(n))
+        return True
+
+    def _integrate(self, coupling: Coupling, dt: float, substeps: int, tool: Tool | None) -> float:
+        size = 3 * self.mesh.node_count
+        moving = self._v[:size]
+        calm = self.loads is None or self.loads.settled
+        if tool is None and calm and float(np.abs(moving).max()) < _AT_REST:
+            # Decay would continue into denormal numbers, at a hundred times the cost.
+            if self._still >= _STILL_FRAMES:
+                moving[:] = 0.0
+                return 0.0
+            self._still += 1
+        else:
+            self._still = 0
+        coupling = coupling if tool is None else tool.restart()
+        spring = coupling.spring(self.mesh.rest)
+        work, done, whole = 0.0, 0, np.array([[0, self.mesh.node_count]])
+        part, parts = 1, 1 if tool is None else tool.parts
+        while done < substeps:
+            region = self._active.choose(
+                self._u[:size],
+                moving,
+                self.material.beta,
+                self.inverse_mass,
+                coupling,
+                self._frame_time,
+            )
+            steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
+            if self._stiffened is not None:
+                steps = min(steps, SUBSTEPS_BETWEEN)
+                self._stiffened.adapt(self._u[:size], moving, self.inverse_mass, begun=done == 0)
+            if self.loads is not None:
+                steps = min(steps, self.loads.substeps(dt) or steps)
+            steps = min(steps, max(part * substeps // parts - done, 1))
+            work += self._steps(region, spring, dt, steps, first=done, total=substeps)
+            done += steps
+            if self.loads is not None:
+                near = whole if self._active.whole else spans_of(self._active.near)
+                self.loads.advance(self._u[:size], dt * steps, near)
+            if tool is not None and done >= part * substeps // parts:
+                part += 1
+                coupling = tool.after(done / substeps, self.positions)
+                spring = coupling.spring(self.mesh.rest)
+        return work
+
+    def _steps(
+        self, region: Region, spring: Spring, dt: float, steps: int, *, first: int, total: int
+    ) -> float:
+        """Move the nodes of a region by some substeps; return the work of the spring [J]."""
+        size, place = 3 * self.mesh.node_count, region.place
+        at = slice(None) if place is None else place.at
+        u, v = self._u[:size][at], self._v[:size][at]
+        operands = region.operands
+        if place is not None and self.loads is not None:
+            operands = operands._replace(load=self.model.load[place.at[: 3 * place.moving]])
+        work = self._integrator.step(
+            operands,
+            self._present_inverse()[at],
+            self.model.diagonal[at],
+            spring if place is None else place.spring(spring),
+            u,
+            v,
+            dt,
+            steps,
+            spans=region.spans,
+            first=first,
+            total=total,
+        )
+        if place is not None:  # else u and v are the tissue's own
+            own = 3 * place.moving
+            self._u[place.at[:own]], self._v[place.at[:own]] = u[:own], v[:own]
+        return work
+
+    def _present_inverse(self) -> np.ndarray:
+        """Return the inverse masses [1/kg], with those of stiffened nodes, shape (3 n,)."""
+        stiffened, base = self._stiffened, self.inverse_mass
+        return base if stiffened is None else stiffened.inverse(base)
+
+    def _motion(self, dt: float, substeps: int, trouble: str) -> FrameMotion:
+        force, elastic = self._elastic_now()
+        elastic += self._load_energy()
+        kinetic = self._kinetic_energy()
+        slow = dt * substeps / self._frame_time
+        strain = None if self._stiffened is None else self._stiffened.strain
+        return FrameMotion(force, kinetic, elastic, substeps, slow, trouble, strain=strain)
+
+    def _cause(self, coupling: Coupling, dt: float) -> str:
+        name, bound = self.stepping.integrator, self.bound(coupling)
+        limit = f'the {1e3 * bound:.3g} ms at which {name} is stable at {self.omega:.4g} rad/s'
+        if dt > bound:
+            return f'a step of {1e3 * dt:.3g} ms is above {limit}'
+        inverted = self.inverted
+        if inverted:
+            cause = f'{inverted} of {len(self.mesh.tetrahedra)} tetrahedra are inside out'
+        else:
+            cause = f'the tissue is deformed beyond the range of the {self.model.name} model'
+        if np.isinf(bound):
+            return f'{cause}; {name} is stable with any step'
+        return f'{cause}; the step of {1e3 * dt:.3g} ms is below {limit}'
+
+    def apply_cut(self, delta: TopologyDelta) -> Touched:
+        """Apply a change of connectivity; displacement and velocity are interpolated.
+
+        Args:
+            delta: the answer of the cutting service.
+
+        Returns:
+            The written slots.
+
+        Raises:
+            MeshError: the change does not fit the mesh.
+        """
+        self._still = 0
+        n, total = self.mesh.node_count, self.mesh.node_count + len(delta.node_parents)
+        touched = self.mesh.apply(delta)
+        self._u, self._v = grown(self._u, 3 * total), grown(self._v, 3 * total)
+        for values in (self._u, self._v):
+            carried_over(values[: 3 * total].reshape(-1, 3), n, delta, touched)
+        self.model.update(touched)
+        if self.loads is not None:
+            self.loads.apply_cut(n, delta, touched)
+        self._follow_cut(touched.nodes)
+        return touched
+
+    def resume(self, displacement: np.ndarray) -> None:
+        """Continue from a shape at rest, relaxed.
+
+        Args:
+            displacement: [m], shape (n, 3).
+        """
+        self.displacement[:] = displacement
+        self.velocity[:] = 0.0
+        if self.loads is not None:
+            self.loads.relax(self._u[: 3 * self.mesh.node_count])
+        self.restart()
+
+    def restart(self) -> None:
+        """Make the present displacement and velocity the start of the next frame.
+
+        The rotations converge, and the energy balance restarts.
+        """
+        self._active.wake()
+        self._begin_account()
+
+    def _begin_account(self) -> None:
+        energy = self._elastic_now()[1] + self._load_energy()
+        self._detector.open(energy + self._kinetic_energy())
+        self._still = 0
+
+    def _elastic_now(self) -> tuple[np.ndarray, float]:
+        """Return force [N], shape (n, 3), and energy [J], recomputed where they may have
+        changed.
+        """
+        if self._active.whole:
+            self._touched = []
+            return self._elastic.whole(self.displacement)
+        n, touched = self.mesh.node_count, self._touched
+        self._touched = []
+        changed = np.concatenate([self._active.moved(), *touched])
+        return self._elastic.renewed(self.displacement, changed[changed < n])
+
+    def _load_energy(self) -> float:
+        """Return the energy of weight and viscosity [J]."""
+        if self.loads is None:
+            return 0.0
+        return self.loads.energy(self._u[: 3 * self.mesh.node_count])
+
+    def _kinetic_energy(self) -> float:
+        v, inertia = self.velocity, self._inertia[: self.mesh.node_count]
+        if self._stiffened is not None:
+            inertia = 1.0 / np.maximum(self._present_inverse()[::3], 1e-300)
+            inertia = np.where(self.inverse_mass[::3] > 0.0, inertia, 0.0)
+        if not self._active.whole:  # the others are at rest
+            v, inertia = v[self._active.nodes], inertia[self._active.nodes]
+        return 0.5 * float((inertia * np.square(v).sum(axis=1)).sum())
+
+    def _follow_cut(self, nodes: np.ndarray) -> None:
+        """Update nodal data where a cut touched it, nodes of shape (r,)."""
+        n = self.mesh.node_count
+        if len(self._inertia) < n:
+            self._inertia = grown(self._inertia, n)
+            self._inverse = grown(self._inverse, 3 * len(self._inertia))
+        self._frequency.update(nodes, self.inverse_mass)
+        self._inertia[nodes] = self._frequency.inertia(nodes)
+        free = self.mesh.fixed[nodes] == 0
+        inverse = np.where(free, 1.0 / self._inertia[nodes], 0.0)
+        self.inverse_mass.reshape(-1, 3)[nodes] = inverse[:, None]
+        if self._stiffened is not None:
+            self._stiffened.follow_cut()
+        self._active.follow_cut(nodes)
+        self._touched.append(nodes)

@@ -1,0 +1,152 @@
+"""Explicit time steps of M u'' + (alpha M + beta K) u' + K u = f; K u is any model's force.
+
+Damping costs no force evaluation of its own: the force is taken at u + beta v.
+"""
+
+import numpy as np
+
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.contact.coupling import (
+    force_of_spring,
+    spring_work,
+    start_of_work,
+    subtract_spring,
+)
+from cutting_trainer.tissue_sim.elasticity.models import internal_force
+
+# Slices begin at 0: a possibly negative index would prevent vectorisation.
+
+
+@inner(error_model='numpy')
+def _copy(intervals, source, target):
+    for s in range(intervals.shape[0]):
+        a, b = 3 * intervals[s, 0], 3 * intervals[s, 1]
+        for i in range(a, b):
+            target[i] = source[i]
+
+
+@inner(error_model='numpy')
+def _ahead(q, u, v, beta):
+    for i in range(q.shape[0]):
+        q[i] = u[i] + beta * v[i]
+
+
+@inner(error_model='numpy')
+def _euler(u, v, q, f, inverse_mass, alpha, beta, dt, symplectic):
+    """Compute a step, and q = u + beta v for the next, while the data are in the cache."""
+    for i in range(u.shape[0]):
+        before = v[i]
+        after = before + dt * (-f[i] * inverse_mass[i] - alpha * before)
+        place = u[i] + dt * (after if symplectic else before)
+        u[i], v[i], q[i] = place, after, place + beta * after
+
+
+@inner(error_model='numpy')
+def _stage(f, inverse_mass, u, v, us, vs, du, dv, alpha, share, ahead):
+    for i in range(f.shape[0]):
+        a = -f[i] * inverse_mass[i] - alpha * vs[i]
+        w = vs[i]
+        du[i] += share * w
+        dv[i] += share * a
+        us[i] = u[i] + ahead * w
+        vs[i] = v[i] + ahead * a
+
+
+@kernel(error_model='numpy')
+def euler_steps(
+    operands, spans, inverse_mass, damping, spring, u, v, work, dt, first, steps, total, symplectic
+):
+    """Compute steps of Euler's methods: v by its rate at the start of the step, u by the v at start
+    or end.
+
+    Forward Euler (thesis 4.4.1) is unstable for any undamped spring, so the coupling spring gets
+    the tissue's beta.
+
+    Args:
+        operands: of the model, see `elasticity.Operands`.
+        spans: intervals of moving nodes, shape (s, 2).
+        inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
+        damping: alpha [1/s] and beta [s].
+        spring: the coupling, with its law, see `coupling.Spring`.
+        u, v: displacement [m] and velocity [m/s], changed in place, shape (3 n,).
+        work: scratch, shape (6, >= 3 n).
+        dt: step [s].
+        first, steps, total: number of the first step, how many, and how many a frame has.
+        symplectic: whether u uses the new v; else the old one (forward Euler).
+
+    Returns:
+        Work of the spring on the tissue [J].
+    """
+    alpha, beta = damping[0], damping[1]
+    q, f = work[2, : u.shape[0]], work[3, : u.shape[0]]
+    held = u if symplectic else q
+    force, last = np.zeros(3), np.zeros((2, 3))
+    done = start_of_work(spring, u, last)
+    _copy(operands.reach, u, q)
+    for s in range(spans.shape[0]):
+        a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+        _ahead(q[a:b], u[a:b], v[a:b], beta)
+    for step in range(first, first + steps):
+        internal_force(operands, q, f, 1)
+        if spring.mode != 0:
+            subtract_spring(spring, step / total, held, f, force)
+            if not symplectic:
+                # Of the spring alone: its damping force does no work on the tissue.
+                force_of_spring(spring, step / total, u, force)
+            done += spring_work(spring, force, u, last)
+        for s in range(spans.shape[0]):
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            _euler(u[a:b], v[a:b], q[a:b], f[a:b], inverse_mass[a:b], alpha, beta, dt, symplectic)
+    if spring.mode != 0:
+        force_of_spring(spring, (first + steps) / total, u, force)
+        done += spring_work(spring, force, u, last)
+    return done
+
+
+@kernel(error_model='numpy')
+def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, first, steps, total):
+    """Compute steps of the classical fourth-order Runge-Kutta method on u and v together.
+
+    Thesis 4.4.3, with the velocity updated by its own stages. Arguments and result: see
+    `euler_steps`.
+    """
+    alpha, beta = damping[0], damping[1]
+    size = u.shape[0]
+    us, vs, q = work[0, :size], work[1, :size], work[2, :size]
+    f, du, dv = work[3, :size], work[4, :size], work[5, :size]
+    force, last = np.zeros(3), np.zeros((2, 3))
+    done = start_of_work(spring, u, last)
+    _copy(operands.reach, u, q)
+    for step in range(first, first + steps):
+        for s in range(spans.shape[0]):
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            us[a:b] = u[a:b]
+            vs[a:b] = v[a:b]
+            du[a:b] = 0.0
+            dv[a:b] = 0.0
+        for stage in range(4):
+            for s in range(spans.shape[0]):
+                a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+                _ahead(q[a:b], us[a:b], vs[a:b], beta)
+            internal_force(operands, q, f, 1)
+            if spring.mode != 0:
+                at = (step + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / total
+                subtract_spring(spring, at, us, f, force)
+                if stage == 0:
+                    done += spring_work(spring, force, u, last)
+            share = dt / 6.0 if stage == 0 or stage == 3 else dt / 3.0
+            ahead = dt if stage == 2 else 0.5 * dt
+            for s in range(spans.shape[0]):
+                a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+                _stage(
+                    f[a:b], inverse_mass[a:b], u[a:b], v[a:b], us[a:b], vs[a:b], du[a:b], dv[a:b],
+                    alpha, share, ahead,
+                )  # fmt: skip
+        for s in range(spans.shape[0]):
+            a, b = 3 * spans[s, 0], 3 * spans[s, 1]
+            u[a:b] += du[a:b]
+            v[a:b] += dv[a:b]
+    if spring.mode != 0:
+        force_of_spring(spring, (first + steps) / total, u, force)
+        done += spring_work(spring, force, u, last)
+    return done

@@ -1,0 +1,216 @@
+"""Backward Euler by conjugate gradients on the same tensors: no matrix, nothing to factorise.
+
+With h the step, the velocity at its end solves
+
+    ((1 + h alpha) M + (h^2 + h beta) K + h^2 W^T A W) v = M v_0 + h (W^T A (p - W u_0) - f(u_0))
+
+K is the stiffness with the rotations at the start of the step. A is the secant of the coupling
+spring at the end of the step, p the tool's end of it, W the weighted mean of its nodes. The
+solution is repeated until A fits it: a contact that opens, or a blade that yields, does so at the
+end of the step as well.
+"""
+
+import numpy as np
+
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.contact.coupling import (
+    HOLD,
+    PUSH,
+    spring_force,
+    spring_stretch,
+    spring_work,
+    start_of_work,
+)
+from cutting_trainer.tissue_sim.elasticity.models import internal_force, stiffness_product
+
+_SECANTS = 6
+
+
+@inner(error_model='numpy')
+def _secant(spring, stretch, matrix):
+    """Compute the symmetric matrix that maps this stretch to the force of the spring.
+
+    Args:
+        spring: see `coupling.Spring`.
+        stretch: [m], shape (3,).
+        matrix: in: the last one; output [N/m], shape (3, 3).
+
+    Returns:
+        Largest change of an entry, as a share of the spring's stiffness.
+    """
+    force = np.empty(3)
+    spring_force(spring.mode, stretch, spring.normal, spring.scalars, force)
+    n, k = spring.normal, spring.scalars[0]
+    along = across = within = length = pull = 0.0
+    for i in range(3):
+        along += stretch[i] * n[i]
+        length += stretch[i] * stretch[i]
+        pull += force[i] * force[i]
+    for i in range(3):
+        across += (stretch[i] - along * n[i]) ** 2
+        within += force[i] * (stretch[i] - along * n[i])
+    side = front = 0.0
+    if spring.mode == PUSH and along < 0.0:
+        front = k
+        if spring.scalars[2] > 0.0:
+            front = 0.0
+            for i in range(3):
+                front += force[i] * n[i] / along
+        side = within / across if across > 0.0 else k
+    elif spring.mode == HOLD:
+        front = side = np.sqrt(pull / length) if length > 0.0 else k
+    change = 0.0
+    for i in range(3):
+        for j in range(3):
+            value = (front - side) * n[i] * n[j] + (side if i == j else 0.0)
+            change = max(change, abs(value - matrix[i, j]))
+            matrix[i, j] = value
+    return change / max(k, 1e-300)
+
+
+@inner(error_model='numpy')
+def _product(operands, spans, inverse_mass, spring, matrix, factors, x, out):
+    """Compute the left-hand side times x, at the moving nodes; `factors`: of M, K and the
+    spring.
+    """
+    stiffness_product(operands, x, out)
+    mean = np.zeros(3)
+    if spring.mode != 0:
+        for c in range(spring.nodes.shape[0]):
+            for i in range(3):
+                mean[i] += spring.weights[c] * x[3 * spring.nodes[c] + i]
+    for s in range(spans.shape[0]):
+        for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+            if inverse_mass[i] > 0.0:
+                out[i] = factors[1] * out[i] + factors[0] / inverse_mass[i] * x[i]
+            else:
+                out[i] = 0.0
+    if spring.mode != 0:
+        for c in range(spring.nodes.shape[0]):
+            for i in range(3):
+                at = 3 * spring.nodes[c] + i
+                if inverse_mass[at] > 0.0:
+                    for j in range(3):
+                        out[at] += factors[2] * spring.weights[c] * matrix[i, j] * mean[j]
+
+
+@inner(error_model='numpy')
+def _solve(
+    operands, spans, inverse_mass, spring, matrix, factors, inverse, b, x, r, p, q, least, most
+):
+    """Run conjugate gradients from x until the residual, weighted by the diagonal, is `least`."""
+    _product(operands, spans, inverse_mass, spring, matrix, factors, x, q)
+    rho = 0.0
+    p[:] = 0.0
+    for s in range(spans.shape[0]):
+        for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+            r[i] = b[i] - q[i]
+            p[i] = inverse[i] * r[i]
+            rho += r[i] * p[i]
+    for iteration in range(most):
+        if rho <= least:
+            return iteration
+        _product(operands, spans, inverse_mass, spring, matrix, factors, p, q)
+        curvature = 0.0
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                curvature += p[i] * q[i]
+        if not curvature > 0.0:
+            return iteration
+        step = rho / curvature
+        after = 0.0
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                x[i] += step * p[i]
+                r[i] -= step * q[i]
+                after += inverse[i] * r[i] * r[i]
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                p[i] = inverse[i] * r[i] + after / rho * p[i]
+        rho = after
+    return most
+
+
+@kernel(error_model='numpy')
+def implicit_steps(
+    operands, spans, inverse_mass, damping, spring, diagonal, tolerance,
+    u, v, work, dt, first, steps, total,
+):  # fmt: skip
+    """Compute steps of backward Euler, linearised about the start of each step.
+
+    Arguments not named here: see `explicit.euler_steps`.
+
+    Args:
+        diagonal: of the stiffness of plain elements [N/m], shape (3 n,).
+        tolerance: of the residual, relative to the loads.
+        work: scratch, shape (7, >= 3 n).
+
+    Returns:
+        Work of the spring on the tissue [J].
+    """
+    alpha, beta = damping[0], damping[1]
+    size = u.shape[0]
+    b, x, r = work[0, :size], work[1, :size], work[2, :size]
+    p, q, f, inverse = work[3, :size], work[4, :size], work[5, :size], work[6, :size]
+    factors = np.array([1.0 + dt * alpha, dt * dt + dt * beta, dt * dt])
+    stretch, force, matrix = np.empty(3), np.zeros(3), np.zeros((3, 3))
+    last = np.zeros((2, 3))
+    done = start_of_work(spring, u, last)
+    for s in range(spans.shape[0]):
+        for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+            free = inverse_mass[i] > 0.0
+            inverse[i] = (
+                1.0 / (factors[0] / inverse_mass[i] + factors[1] * diagonal[i]) if free else 0.0
+            )
+    x[:] = v
+    for step in range(first, first + steps):
+        at = (step + 1) / total
+        internal_force(operands, u, f, 3)
+        for attempt in range(_SECANTS):
+            if spring.mode != 0:
+                # Estimated stretch at the end of the step.
+                for i in range(size):
+                    q[i] = u[i] + dt * x[i]
+                spring_stretch(spring, at, q, stretch)
+                change = _secant(spring, stretch, matrix)
+                if attempt > 0 and change < 1e-6:
+                    break
+                spring_stretch(spring, at, u, stretch)
+                for i in range(3):
+                    force[i] = 0.0
+                    for j in range(3):
+                        force[i] += matrix[i, j] * stretch[j]
+            scale = 0.0
+            for s in range(spans.shape[0]):
+                for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                    if inverse_mass[i] > 0.0:
+                        momentum, impulse = v[i] / inverse_mass[i], dt * f[i]
+                        b[i] = momentum - impulse
+                        scale += inverse[i] * (momentum * momentum + impulse * impulse)
+                    else:
+                        b[i] = 0.0
+            for c in range(spring.nodes.shape[0]):
+                for i in range(3):
+                    k = 3 * spring.nodes[c] + i
+                    if inverse_mass[k] > 0.0:
+                        load = dt * spring.weights[c] * force[i]
+                        b[k] += load
+                        scale += inverse[k] * load * load
+            _solve(
+                operands, spans, inverse_mass, spring, matrix, factors, inverse, b, x, r, p, q,
+                tolerance * tolerance * scale, 4 * 250,
+            )  # fmt: skip
+            if spring.mode == 0:
+                break
+        if spring.mode != 0:
+            for i in range(size):
+                q[i] = u[i] + dt * x[i]
+            spring_stretch(spring, at, q, stretch)
+            spring_force(spring.mode, stretch, spring.normal, spring.scalars, force)
+            last[0] = force
+            done += spring_work(spring, force, q, last)
+        for s in range(spans.shape[0]):
+            for i in range(3 * spans[s, 0], 3 * spans[s, 1]):
+                v[i] = x[i]
+                u[i] += dt * v[i]
+    return done

@@ -1,0 +1,130 @@
+"""Data of the planner: the scene's task, and cost and errors of a method."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ModelName
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+from cutting_trainer.tissue_sim.planner.budget import Budget
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """Relative errors of displacement under a load, by cause.
+
+    Attributes:
+        elements: element size.
+        rotation: largest rotation, for models without rotations.
+        strain: largest displacement, for the model's strain measure.
+        time: step size, at the pace of a palpating hand.
+        region: held nodes.
+    """
+
+    elements: float
+    rotation: float
+    strain: float
+    time: float = 0.0
+    region: float = 0.0
+
+    @property
+    def large(self) -> float:
+        """Error by large deformation: rotation and strain have one cause, and the larger counts."""
+        return max(self.rotation, self.strain)
+
+    @property
+    def total(self) -> float:
+        """Total of all causes."""
+        return self.elements + self.large + self.time + self.region
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a frame.
+
+    Attributes:
+        substeps: required by stability.
+        step: each [s].
+        fixed: CPU time of a frame without its substeps [s].
+        each: CPU time of a substep [s].
+    """
+
+    substeps: int
+    step: float
+    fixed: float
+    each: float
+
+    @property
+    def frame(self) -> float:
+        """CPU time of a frame [s]."""
+        return self.fixed + self.substeps * self.each
+
+    def grown(self, factor: float) -> 'Cost':
+        """Return the cost of `factor` times the substeps."""
+        return Cost(math.ceil(self.substeps * factor), self.step / factor, self.fixed, self.each)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A method with its errors and cost on the scene."""
+
+    model: ModelName
+    integrator: IntegratorName
+    errors: ErrorEstimate
+    cost: Cost
+    active: ActiveSettings = field(default=ActiveSettings())
+
+    @property
+    def name(self) -> str:
+        """Model, integrator, and the active region if there is one."""
+        region = {
+            'off': '',
+            'on': ', active region on',
+            'budget': f', active region of {self.active.nodes} nodes',
+        }
+        return f'{self.model} by {self.integrator}{region[self.active.mode]}'
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scene as input of the planner.
+
+    Attributes:
+        mesh, material, resistance: the tissue.
+        budget: the requirements.
+        stepping: of the scene; its integrator is ignored.
+    """
+
+    mesh: TetMesh
+    material: Material
+    resistance: Resistance
+    budget: Budget
+    stepping: TimeStepping
+
+    @property
+    def available(self) -> float:
+        """CPU time allowed for a frame [s]."""
+        return self.budget.cores / self.stepping.rate
+
+    def worst(self, candidate: Candidate) -> Cost:
+        """Return the cost of a method after cuts have shortened the step as far as allowed."""
+        explicit = candidate.integrator != 'implicit'
+        growth = self.stepping.frequency_growth if self.budget.cuts and explicit else 1.0
+        return candidate.cost.grown(growth)
+
+    def in_time(self, candidate: Candidate) -> bool:
+        """Return whether a method meets the allowed cost."""
+        cost = self.worst(candidate)
+        return cost.substeps <= self.stepping.max_substeps and cost.frame <= self.available
+
+    def fits(self, candidate: Candidate) -> bool:
+        """Return whether a method meets the allowed cost and error."""
+        return self.in_time(candidate) and candidate.errors.total <= self.budget.error
+
+    def stepped_by(self, candidate: Candidate) -> TimeStepping:
+        """Return the time stepping of a method."""
+        return replace(self.stepping, integrator=candidate.integrator)

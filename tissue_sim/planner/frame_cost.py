@@ -1,0 +1,183 @@
+"""Measured CPU time of a method's frames on a scene, and savings by an active region."""
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact, indenter_contact
+from cutting_trainer.tissue_sim.elasticity.models import ModelName
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost, Task
+from cutting_trainer.tissue_sim.planner.indentation import Indenter, places
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+
+_SHORT, _LONG = 4, 16
+_FRAMES = 16
+_REPEATS = 3
+"""Strokes; the least time of each frame counts, because other load only adds to it."""
+_COUPLING = 200.0
+"""Stiffness of the coupling spring in the measurement [N/m]."""
+
+
+def frame_cost(task: Task, model: ModelName, integrator: IntegratorName) -> Cost:
+    """Return the CPU time of frames in which a tool goes in and out.
+
+    Frames are cut short and extrapolated by their number of substeps, so that very slow methods do
+    not delay the planner.
+    """
+    indenters = places(task.mesh, task.budget.contact_radius)
+    if integrator == 'implicit':  # the number of iterations depends on place and depth
+        found = [_Timed(task, model, integrator, indenter, _LONG) for indenter in indenters]
+        for timed in found:
+            timed.stroke(_REPEATS)
+        return Cost(found[0].substeps, found[0].step, max(timed.frame for timed in found), 0.0)
+    long, short = (_Timed(task, model, integrator, indenters[0], most) for most in (_LONG, _SHORT))
+    for _ in range(_REPEATS):  # alternately, so that both see the same load of the machine
+        long.stroke()
+        if long.substeps > _LONG:
+            short.stroke()
+    if long.substeps == 1:
+        return Cost(1, long.step, long.frame, 0.0)
+    if long.substeps <= _LONG:
+        return Cost(long.substeps, long.step, 0.0, long.frame / long.substeps)
+    each = max((long.frame - short.frame) / (_LONG - _SHORT), long.frame / _LONG / 4)
+    return Cost(long.substeps, long.step, max(long.frame - _LONG * each, 0.0), each)
+
+
+def frame_time(integrator: IntegratorName, times: list[float]) -> float:
+    """Return the representative time of frames [s]: the median, or the 90th percentile for
+    iterative methods.
+
+    Args:
+        integrator: which one.
+        times: of frames [s].
+    """
+    return float(np.percentile(times, 90 if integrator == 'implicit' else 50))
+
+
+class _Timed:
+    """A timed simulation with a bounded number of substeps per frame.
+
+    Attributes:
+        substeps: required by a frame, of `step` [s] each.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        model: ModelName,
+        integrator: IntegratorName,
+        indenter: Indenter,
+        most: int,
+    ) -> None:
+        s = task.stepping
+        stepping = replace(
+            s, integrator=integrator, min_substeps=min(s.min_substeps, most), max_substeps=most
+        )
+        self._simulation = TissueSimulation(
+            task.mesh, task.material, task.resistance, model=model, stepping=stepping
+        )
+        self._contacts = _in_and_out(task, indenter)
+        self._times: list[list[float]] = []
+        self.substeps, self.step = 0, 0.0
+
+    def stroke(self, repeats: int = 1) -> None:
+        """Move a tool in and out."""
+        for _ in range(repeats):
+            times = []
+            for contact in self._contacts:
+                frame, spent = _timed(self._simulation, contact)
+                times.append(spent)
+            self._times.append(times[1:])
+        needed = frame.substeps / max(frame.slow_motion, 1e-12)
+        self.substeps = math.ceil(needed - 1e-9)
+        self.step = float(1 / self._simulation.dynamics.stepping.rate / needed)
+
+    @property
+    def frame(self) -> float:
+        """CPU time of a frame [s]."""
+        integrator = self._simulation.dynamics.stepping.integrator
+        return frame_time(integrator, np.min(self._times, axis=0).tolist())
+
+
+def _in_and_out(task: Task, indenter: Indenter) -> list[ToolContact]:
+    # Below the force at which the blade enters.
+    depth = min(0.9 * task.resistance.threshold / _COUPLING, 0.5 * task.budget.displacement)
+    shares = [math.sin(math.pi * number / _FRAMES) ** 2 for number in range(_FRAMES)]
+    place = indenter.centre, indenter.direction
+    return [indenter_contact(task.mesh, *place, share * depth, _COUPLING) for share in shares]
+
+
+def _timed(simulation: TissueSimulation, contact: ToolContact | None) -> tuple[Frame, float]:
+    """Return a frame, and its CPU time [s]."""
+    start = time.thread_time()
+    frame = simulation.frame(contact)
+    return frame, time.thread_time() - start
+
+
+class _Strokes:
+    """Timed frames in which a tool goes in, out, and stays away, with an active region."""
+
+    def __init__(self, task: Task, candidate: Candidate, active: ActiveSettings) -> None:
+        self._simulation = TissueSimulation(
+            task.mesh,
+            task.material,
+            task.resistance,
+            model=candidate.model,
+            stepping=task.stepped_by(candidate),
+            active=active,
+        )
+        indenter = places(task.mesh, task.budget.contact_radius, 1)[0]
+        self._contacts = _in_and_out(task, indenter)
+        self._times: list[list[float]] = []
+
+    def stroke(self) -> np.ndarray:
+        """Return the displacement after each frame [m], shape (f, n, 3)."""
+        times, seen = [], []
+        for contact in [*self._contacts, *[None] * _FRAMES]:
+            times.append(_timed(self._simulation, contact)[1])
+            seen.append(self._simulation.displacement.copy())
+        self._times.append(times[1:_FRAMES])
+        return np.array(seen)
+
+    @property
+    def frame(self) -> float:
+        """CPU time of a frame in contact [s]."""
+        return float(np.median(np.min(self._times, axis=0)))
+
+
+def with_regions(
+    task: Task, candidate: Candidate, regions: list[ActiveSettings]
+) -> list[Candidate]:
+    """Return the method with some active regions, with measured cost and error.
+
+    The error is the largest difference of any node's displacement while a tool goes in, out, and
+    stays away, relative to the largest displacement.
+
+    Args:
+        task: the scene.
+        candidate: the method with all nodes moving.
+        regions: the active regions.
+    """
+    whole, *parts = (_Strokes(task, candidate, r) for r in [ActiveSettings(), *regions])
+    right, *others = [strokes.stroke() for strokes in [whole, *parts]]
+    for _ in range(_REPEATS - 1):  # alternately, so that all see the same load of the machine
+        for strokes in [whole, *parts]:
+            strokes.stroke()
+    most = float(np.linalg.norm(right, axis=2).max())
+    found = []
+    for region, part, seen in zip(regions, parts, others, strict=True):
+        wrong = float(np.linalg.norm(seen - right, axis=2).max()) / most
+        share, cost = part.frame / whole.frame, candidate.cost
+        found.append(
+            replace(
+                candidate,
+                active=region,
+                errors=replace(candidate.errors, region=wrong),
+                cost=replace(cost, fixed=share * cost.fixed, each=share * cost.each),
+            )
+        )
+    return found

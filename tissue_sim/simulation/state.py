@@ -1,0 +1,135 @@
+"""Whole state of a tissue simulation: frames computed from it are identical bit by bit."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from cutting_trainer.tissue_sim.contact import (
+    blade,
+    coupling,
+    footprint,
+    fracture,
+    friction,
+    tool_spring,
+)
+from cutting_trainer.tissue_sim.contact import tool as contact
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.elasticity import (
+    adaptive_law,
+    compliance,
+    corotational,
+    local_rows,
+    material,
+    tensor_mass,
+    viscosity,
+)
+from cutting_trainer.tissue_sim.elasticity import models as elasticity
+from cutting_trainer.tissue_sim.elasticity import nodal_smoothing as domains
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.mesh import adjacency as rings
+from cutting_trainer.tissue_sim.mesh import tetra_mesh as mesh
+from cutting_trainer.tissue_sim.mesh import topology
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion import (
+    active_region,
+    dynamics,
+    elastic_state,
+    integrators,
+    loads,
+    stability,
+    stiffened_mass,
+)
+from cutting_trainer.tissue_sim.motion import divergence as guard
+from cutting_trainer.tissue_sim.simulation import local_stiffness as contact_stiffness
+from cutting_trainer.tissue_sim.simulation import simulation
+from cutting_trainer.tissue_sim.simulation.object_state import (
+    ObjectState,
+    capture,
+    classes_of,
+    rebuild,
+)
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+from cutting_trainer.tissue_sim.simulation.state_checks import check_simulation, checked
+
+_MODULES = (
+    active_region,
+    adaptive_law,
+    blade,
+    compliance,
+    contact,
+    contact_stiffness,
+    corotational,
+    coupling,
+    domains,
+    dynamics,
+    elastic_state,
+    elasticity,
+    footprint,
+    fracture,
+    friction,
+    guard,
+    integrators,
+    loads,
+    local_rows,
+    material,
+    mesh,
+    rings,
+    simulation,
+    stability,
+    stiffened_mass,
+    tensor_mass,
+    tool_spring,
+    topology,
+    viscosity,
+)
+MESH_CLASSES = classes_of((mesh, topology))
+_CLASSES = classes_of(_MODULES)
+
+
+def state_of(simulation: TissueSimulation) -> ObjectState:
+    """Return the state that all later frames depend on, apart from contacts and cuts."""
+    return capture(simulation, _CLASSES)
+
+
+def from_state(state: ObjectState) -> TissueSimulation:
+    """Return the simulation of a state.
+
+    Args:
+        state: as returned by `state_of`.
+
+    Raises:
+        StateError: the state is not valid, is of another version, or has an index out of range.
+    """
+    material, resistance = Material(1e4, 0.4, 1e3, 1.0, 1e-3), Resistance(1.0, 1.0, 1.0)
+    like = TissueSimulation(smallest_mesh(), material, resistance)
+    restored: TissueSimulation = rebuild(state, _CLASSES, like)
+    checked(check_simulation, restored)
+    return restored
+
+
+def smallest_mesh() -> TetMesh:
+    """Return one tetrahedron fixed at one face, of this version's classes."""
+    nodes = 0.01 * np.vstack([np.eye(3), np.zeros((1, 3))])
+    fixed = np.array([0, 1, 1, 1], np.uint8)
+    return TetMesh(nodes, np.array([[3, 0, 1, 2]]), fixed)
+
+
+def shape_of(simulation: TissueSimulation) -> MeshReplica:
+    """Return mesh, displacement and frame of a simulation, without its dynamics."""
+    m = simulation.mesh
+    shape = MeshReplica()
+    shape.load(
+        SimpleNamespace(
+            rest=m.rest.ravel(),
+            displacement=simulation.displacement.ravel(),
+            fixed=m.fixed,
+            tetrahedra=m.tetrahedra.ravel(),
+            triangles=m.triangles.ravel(),
+            triangle_kind=m.triangle_kind,
+            revision=0,
+            topology=m.topology,
+            step=simulation.step,
+        )
+    )
+    return shape

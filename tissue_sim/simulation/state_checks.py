@@ -1,0 +1,358 @@
+"""Bounds checks of an untrusted state.
+
+Compiled kernels do not check indices: an index beyond an array would overwrite foreign memory.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from cutting_trainer.tissue_sim.contact.fracture import KNOTS
+from cutting_trainer.tissue_sim.contact.friction import GrippingSprings
+from cutting_trainer.tissue_sim.elasticity.adaptive_law import Law
+from cutting_trainer.tissue_sim.elasticity.corotational import KEPT, Elements
+from cutting_trainer.tissue_sim.elasticity.local_rows import Locality
+from cutting_trainer.tissue_sim.elasticity.models import Operands
+from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import NodalSmoothing, SmoothingDomains
+from cutting_trainer.tissue_sim.elasticity.rotation import LANES
+from cutting_trainer.tissue_sim.elasticity.viscosity import KEPT as KEPT_OF_TERM
+from cutting_trainer.tissue_sim.elasticity.viscosity import ViscousNodes
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.simulation.object_state import StateError
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+
+
+def checked(check: Callable[[Any], None], made: object) -> None:
+    """Run a check of an object rebuilt from a state.
+
+    Raises:
+        StateError: one sentence about any failure.
+    """
+    try:
+        check(made)
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+        raise StateError(f'the recorded state cannot be used: {error}') from None
+
+
+def within(label: str, numbers: Any, limit: int, least: int = 0) -> None:
+    """Refuse integers outside `least` to `limit` - 1.
+
+    Raises:
+        StateError: a number is out of range or no integer.
+    """
+    array = np.asarray(numbers)
+    if array.dtype.kind not in 'iu':
+        raise StateError(f'{label} has no whole numbers')
+    if array.size and (int(array.min()) < least or int(array.max()) >= limit):
+        worst = int(array.max()) if int(array.max()) >= limit else int(array.min())
+        raise StateError(f'{label} has {worst}; allowed are {least} to {limit - 1}')
+
+
+def has_room(label: str, array: np.ndarray, rows: int, *columns: int) -> None:
+    """Refuse an array with too few rows, or with rows of another shape.
+
+    Raises:
+        StateError: the array is too small or has another shape.
+    """
+    if array.ndim != 1 + len(columns) or len(array) < rows or array.shape[1:] != columns:
+        raise StateError(f'{label} has shape {array.shape} for {rows} rows of {columns}')
+
+
+def check_mesh(mesh: TetMesh) -> None:
+    """Refuse a mesh whose connectivity has an index out of range or a cycle.
+
+    Raises:
+        StateError: the first error.
+    """
+    links, n = mesh.links, mesh.node_count
+    has_room('counts', links.counts, 3)
+    m, k, logged = (int(count) for count in links.counts[:3])
+    within('the counts of the mesh', [n, m, k, logged], 1 << 31)
+    slots = len(links.tetrahedra)
+    for name in ('tetrahedra', 'neighbors', 'face_triangle'):
+        has_room(name, getattr(links, name), max(m, slots), 4)
+    for name in ('corner_next', 'corner_prev'):
+        has_room(name, getattr(links, name), max(4 * m, 4 * slots))
+    for name, rows, *columns in (
+        ('first_corner', n),
+        ('triangles', k, 3),
+        ('triangle_face', k),
+        ('triangle_kind', k),
+        ('log', logged),
+    ):
+        has_room(name, getattr(links, name), rows, *columns)
+    has_room('rest', mesh._rest, n, 3)
+    has_room('fixed', mesh._fixed, n)
+    corners, faces = mesh.tetrahedra.ravel(), mesh.neighbors.ravel()
+    after, before = links.corner_next[: 4 * m], links.corner_prev[: 4 * m]
+    triangle = links.face_triangle[:m].ravel()
+    within('tetrahedra', corners, n)
+    within('triangles', mesh.triangles, n)
+    within('triangle_face', mesh.triangle_face, 4 * m)
+    within('face_triangle', triangle, k, -1)
+    within('log', links.log[:logged], 2 * max(slots, len(links.triangles)) + 2)
+    for name, values in (
+        ('neighbors', faces),
+        ('corner_next', after),
+        ('corner_prev', before),
+        ('first_corner', links.first_corner[:n]),
+    ):
+        within(name, values, 4 * m, -1)
+    every = np.arange(4 * m)
+    first = links.first_corner[:n]
+    heads = np.flatnonzero(first >= 0)
+    for said, to, back in (
+        ('neighbors', faces, faces),
+        ('corner_next', after, before),
+        ('corner_prev', before, after),
+        ('face_triangle', triangle, mesh.triangle_face),
+    ):
+        linked = to >= 0
+        if not np.array_equal(back[to[linked]], every[linked]):
+            raise StateError(f'{said} does not lead back')
+    if (before[first[heads]] >= 0).any() or not np.array_equal(corners[first[heads]], heads):
+        raise StateError('first_corner is not where the corners of a node begin')
+    if not np.array_equal(corners[after[after >= 0]], corners[after >= 0]):
+        raise StateError('corner_next leads to another node')
+
+
+def check_simulation(simulation: TissueSimulation) -> None:
+    """Refuse a simulation whose kernels would leave their arrays.
+
+    Raises:
+        StateError: the first error.
+    """
+    mesh, dynamics = simulation.mesh, simulation.dynamics
+    model = dynamics.model
+    n = mesh.node_count
+    check_mesh(mesh)
+    meshes = (dynamics.mesh, model.mesh)
+    parts: list[Any] = [model.tensor_mass, model._domains, model._elements, model._neighbours]
+    inner = tuple(part._mesh for part in parts if part is not None)
+    if any(other is not mesh for other in meshes + inner):
+        raise StateError('its parts are of different meshes')
+    for name in ('_u', '_v', '_inverse'):
+        has_room(name, getattr(dynamics, name), 3 * n)
+    has_room('_inertia', dynamics._inertia, n)
+    _check_loads(dynamics, n)
+    if dynamics._stiffened is not None:
+        has_room('_linear', dynamics._stiffened._linear, n)
+    _check_model(model, n)
+    _check_estimates(simulation, n)
+    _check_region(dynamics._active, n)
+    _check_blade(simulation, n)
+
+
+def _check_loads(dynamics: Any, n: int) -> None:
+    load = dynamics.model.load
+    if load.shape not in ((0,), (3 * n,)):
+        raise StateError(f'load has shape {load.shape} for {n} nodes')
+    viscosity = None if dynamics.loads is None else dynamics.loads._viscosity
+    if viscosity is None:
+        return
+    if viscosity._model is not dynamics.model or len(load) != 3 * n:
+        raise StateError('the viscous state is of another tissue')
+    terms = len(viscosity._series)
+    has_room('_series', viscosity._series, terms, 2)
+    has_room('_law', viscosity._law, 4)
+    shapes: list[tuple[int, ...]] = [(KEPT_OF_TERM * terms,), (9,), (), (), (4,)]
+    for name, columns in zip(ViscousNodes._fields, shapes, strict=True):
+        has_room(name, getattr(viscosity.nodes, name), n, *columns)
+    if viscosity._own is not None:
+        _check_domains(viscosity._own._domains, n, 3 * n - 2)
+        _check_room('domains', viscosity._own._domains, viscosity._own._filled, n)
+
+
+def _check_model(model: Any, n: int) -> None:
+    has_room('_mass', model._mass, n)
+    has_room('_norms', model._norms, n)
+    has_room('_diagonal', model._diagonal, 3 * n)
+    if model.tensor_mass is not None:
+        t = model.tensor_mass.tensors
+        _check_rows('tensors', t, t.blocks, 9, n, 3 * n - 2)
+        has_room('diagonal', t.diagonal, n, 6)
+        _check_room('tensors', t, model.tensor_mass._filled, n)
+    if isinstance(model._domains, NodalSmoothing):
+        d = model._domains._domains
+        _check_domains(d, n, 3 * n - 2)
+        _check_room('domains', d, model._domains._filled, n)
+    if model._elements is not None:
+        elements = model._elements
+        within('elements', [elements._count], len(model.mesh.tetrahedra) + 1)
+        _check_elements(elements._elements, 3 * n - 2)
+        has_room('elements', elements._elements.corners, 4 * -(-elements._count // LANES) * LANES)
+    if len(model._law.domains):
+        _check_law(model._law)
+    if model._neighbours is not None:
+        rows = model._neighbours._rows
+        _check_rows('neighbours', rows, rows.columns, 1, n, n)
+        _check_room('neighbours', rows, model._neighbours._filled, n)
+        has_room('_seen', model._neighbours._seen, n)
+
+
+def _check_rows(label: str, rows: Any, values: np.ndarray, width: int, n: int, limit: int) -> None:
+    """Refuse rows of n nodes whose used slots, or columns below a limit, are out of range."""
+    slots = len(rows.columns)
+    for name in ('start', 'used'):
+        has_room(f'{name} of {label}', getattr(rows, name), n)
+    start, used = rows.start[:n], rows.used[:n]
+    within(f'start of {label}', start[used > 0], slots)
+    within(f'used of {label}', used, slots + 1)
+    within(f'the last slots of {label}', (start + used)[used > 0], slots + 1)
+    has_room(f'values of {label}', values, width * slots)
+    ends = np.cumsum(used)
+    if n and int(ends[-1]) > slots:
+        raise StateError(f'rows of {label} overlap')
+    at = np.arange(int(ends[-1]) if n else 0) + np.repeat(start - ends + used, used)
+    within(f'columns of {label}', rows.columns[at], limit)
+
+
+def _check_room(label: str, rows: Any, filled: np.ndarray, n: int) -> None:
+    """Refuse rows whose reserved slots are out of range."""
+    slots = len(rows.columns)
+    has_room(f'room of {label}', rows.room, n)
+    has_room(f'filled of {label}', filled, 1)
+    within(f'filled of {label}', filled, slots + 1)
+    room = rows.room[:n]
+    within(f'room of {label}', room, slots + 1)
+    within(f'the room of {label}', (rows.start[:n] + room)[room > 0], slots + 1)
+    if (rows.used[:n] > room).any():
+        raise StateError(f'a row of {label} is longer than its room')
+
+
+def _check_domains(domains: SmoothingDomains, n: int, limit: int) -> None:
+    _check_rows('domains', domains, domains.vectors, 3, n, limit)
+    has_room('volume', domains.volume, n)
+    has_room('rotation', domains.rotation, n, 4)
+    has_room('lame', domains.lame, 2)
+
+
+def _check_elements(elements: Elements, limit: int) -> None:
+    within('corners', elements.corners, max(limit, 1))
+    chunks = len(elements.corners) // (4 * LANES)
+    has_room('data', elements.data, KEPT * LANES * chunks)
+
+
+def _check_law(law: Law) -> None:
+    for name, length in (('domains', 4), ('elements', 4), ('tolerance', 2), ('implicit', 1)):
+        has_room(f'{name} of the law', getattr(law, name), length)
+
+
+def _check_law_operands(operands: Operands) -> None:
+    law = operands.law
+    _check_law(law)
+    nodes, slots = len(operands.domains.used), len(operands.elements.corners) // 4
+    has_room('domain_bounds', law.domain_bounds, nodes)
+    has_room('element_bounds', law.element_bounds, slots)
+    has_room('counters', law.counters, 2)
+    has_room('candidates', law.candidates, len(operands.chunks) * LANES)
+    within('counters', law.counters, len(law.candidates) + LANES, -1)
+    within('the number of candidates', law.counters[1:2], len(law.candidates) + 1)
+    within('candidates', law.candidates, max(slots, 1))
+
+
+def _check_estimates(simulation: TissueSimulation, n: int) -> None:
+    """Check the estimates of frequency and compliance, and the integrator."""
+    dynamics = simulation.dynamics
+    bound: Any = dynamics._frequency
+    has_room('_rows', bound._rows, n)
+    has_room('_x', bound._x, 3 * n)
+    has_room('_inverse_mass', bound._inverse_mass, 3 * n)
+    within('_patch', bound._patch, n if bound._done else 1 << 31)
+    for cut in bound._cut:
+        within('_cut', cut, 1 << 31)
+    stiffness: Any = simulation._stiffness
+    for point in (stiffness._here, stiffness._ahead, getattr(stiffness, '_beside', None)):
+        if point is None:
+            continue
+        if point._topology == simulation.mesh.topology:
+            within('_patch', point._patch, n)
+            has_room('_x', point._x, 0, 3 * n)
+            has_room('_held', point._held, 5, 3 * n)
+    footprints: Any = simulation._springs._footprints
+    if footprints is not None:
+        has_room('_sizes', footprints._sizes, n, 1)
+    if isinstance(simulation._springs, GrippingSprings):
+        has_room('_stretch', simulation._springs._stretch, 3)
+    work: Any = dynamics._integrator._work
+    has_room('_work', work, 7, *work.shape[1:])
+    has_room('_damping', dynamics._integrator._damping, 2)
+
+
+def _check_region(active: Any, n: int) -> None:
+    if active.whole:
+        return
+    has_room('_quiet', active._quiet, n)
+    within('_awake', active._awake, n)
+    within('_near', active._near, n)
+    scratch = active._scratch
+    has_room('_scratch', scratch, 2, *scratch.shape[1:])
+    if (region := active._region) is None:
+        return
+    size = n
+    if region.place is not None:
+        size = _check_place(region.place, n)
+    within('spans', region.spans, size + 1)
+    has_room('spans', region.spans, 0, 2)
+    _check_operands(region.operands, size)
+    _check_operands(region.around, n)
+
+
+def _check_place(place: Locality, n: int) -> int:
+    size = len(place.at) // 3
+    within('at', place.at, 3 * n)
+    has_room('local', place.local, n)
+    within('local', place.local, size, -1)
+    within('moving', [place.moving], size + 1)
+    return size
+
+
+def _check_operands(operands: Operands, size: int) -> None:
+    """Refuse operands for the force on `size` nodes with an index out of range."""
+    limit = 3 * size - 2
+    rows, local = operands.rows, operands.local
+    if len(rows.used):
+        _check_rows('rows', rows, rows.blocks, 9, len(rows.used), limit)
+        has_room('diagonal of rows', rows.diagonal, 6 * len(rows.used))
+        within('nodes of rows', [len(rows.used)], size + 1)
+    if len(operands.domains.used):
+        _check_domains(operands.domains, len(operands.domains.used), limit)
+        within('nodes of domains', [len(operands.domains.used)], size + 1)
+    if len(operands.elements.corners):
+        _check_elements(operands.elements, limit)
+    if len(operands.law.domains):
+        _check_law_operands(operands)
+    within('chunks', operands.chunks, len(operands.elements.corners) // (4 * LANES))
+    for name, spans in (('awake', operands.awake), ('reach', operands.reach)):
+        has_room(name, spans, 0, 2)
+        within(name, spans, size + 1)
+    if len(local.first):
+        slots = len(local.columns)
+        within('first', local.first, slots + 1)
+        within('local columns', local.columns, limit)
+        within('local rows', [len(local.first)], size + 2)
+        has_room('local blocks', local.blocks, 9 * slots + 1)
+
+
+def _check_blade(simulation: TissueSimulation, n: int) -> None:
+    """Check the blade's coupling, and that points have three coordinates."""
+    for name in ('_target', '_device', '_moved'):
+        point = getattr(simulation, name)
+        if point is not None:
+            has_room(name, point, 3)
+    blade: Any = simulation._blade
+    if blade is None:
+        return
+    count = len(blade._points)
+    has_room('_points', blade._points, count, 3)
+    within('corners of the blade', blade._corners, n)
+    inside = int(np.count_nonzero(blade._inside))
+    for name in ('_corners', '_parts'):
+        has_room(name, getattr(blade, name), inside, 4)
+    has_room('_inside', blade._inside, count)
+    has_room('_device', blade._device, 2, 3)
+    for name in ('_tip', '_edge', '_cut_tip', '_cut_edge', 'force', 'torque'):
+        has_room(name, getattr(blade, name), 3)
+    if blade._fracture is not None:
+        has_room('_strips', blade._fracture._strips, 0, 2, KNOTS, 3)

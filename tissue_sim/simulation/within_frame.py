@@ -1,0 +1,100 @@
+"""The tool within a frame: its law is evaluated several times, with the tool on its way.
+
+At 30 Hz a hand moves the blade by millimetres in a frame. Evaluated once, the blade would go in
+late, cut late, and hold on to tissue that it has left.
+"""
+
+import numpy as np
+
+from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance
+from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.tool import ToolContact
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.topology import CUT
+
+_PERIOD_S = 4.2e-3
+"""[s] Longest time between two evaluations: eight in a frame of 30 Hz."""
+
+
+class ToolInFrame:
+    """The tool from the begin to the end of one frame.
+
+    Args:
+        mesh: the tissue, which does not change its connectivity within a frame.
+        resistance: of the tissue.
+        contact: at the end of the frame.
+        before: root and tip of the device's edge at its begin [m], shape (2, 3).
+        pushing: the spring against the surface; free: none.
+        blade: in the tissue; None: it is outside.
+        positions: nodes at the begin of the frame [m], shape (n, 3).
+        frame_time: [s].
+
+    Attributes:
+        blade: at present; None: outside.
+        coupling: the spring at present.
+        parts: of the frame, in each of which there is one spring.
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        resistance: Resistance,
+        contact: ToolContact,
+        before: np.ndarray,
+        pushing: Coupling,
+        blade: Blade | None,
+        positions: np.ndarray,
+        frame_time: float,
+    ) -> None:
+        self._mesh, self._resistance, self._contact = mesh, resistance, contact
+        self._way = before, np.array([contact.blade_root, contact.blade_tip])
+        self._pushing = pushing
+        self._opened = mesh.triangles[mesh.triangle_kind == CUT]
+        self._positions = positions
+        self._kept = None if blade is None else (blade, blade.kept())
+        self.parts = max(int(np.ceil(frame_time / _PERIOD_S - 1e-9)), 1)
+        self.blade = blade
+        self.coupling = pushing
+
+    def restart(self) -> Coupling:
+        """Return to the begin of the frame, and the spring of its first part."""
+        self.blade, self.coupling = None, self._pushing
+        if self._kept is not None:
+            self.blade, kept = self._kept
+            self.blade.restore(kept)
+            self._follow(0.0, self._positions)
+        return self.coupling
+
+    def after(self, share: float, positions: np.ndarray) -> Coupling:
+        """Return the spring of the next part.
+
+        Args:
+            share: of the frame that has passed.
+            positions: nodes now [m], shape (n, 3).
+        """
+        if self.blade is None and self._punctures(share, positions):
+            hint = int(self._mesh.star(int(self._contact.nodes[0]))[0])
+            self.blade = Blade(self._resistance, *self._device(share), hint)
+        if self.blade is not None:
+            self.blade.carry(positions)
+            self._follow(share, positions)
+        return self.coupling
+
+    def _punctures(self, share: float, positions: np.ndarray) -> bool:
+        """Return whether the tool presses harder on the surface than it bears."""
+        spring = self._pushing
+        if spring.mode != PUSH:
+            return False
+        pressed = float(np.linalg.norm(spring.force(positions, share)))
+        return pressed >= self._resistance.threshold
+
+    def _follow(self, share: float, positions: np.ndarray) -> None:
+        assert self.blade is not None
+        stiffness = self._contact.stiffness
+        device = self._device(share)
+        self.blade.follow(self._mesh, positions, device, stiffness, self._opened)
+        self.coupling = self.blade.spring(positions, self._way[1], share, stiffness)
+
+    def _device(self, share: float) -> np.ndarray:
+        """Return root and tip of the device's edge [m], shape (2, 3)."""
+        return np.asarray((1 - share) * self._way[0] + share * self._way[1])

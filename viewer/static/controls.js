@@ -1,0 +1,136 @@
+// The controls of a live session: buttons, choices, the state, the table of nodes.
+
+const STATES = {
+  ENABLED: ['▶', 'FORCE ON'], PAUSED: ['❚❚', 'PAUSED'], DISABLED: ['○', 'FORCE OFF'], FAULT: ['▲', 'FAULT'],
+};
+const LEVELS = [['●', 'ok'], ['▲', 'warning'], ['✕', 'error'], ['?', 'silent']];
+const SCALE_MS = 100;
+const CONTACTS = ['free', 'touching', 'inside'];
+
+const $ = (id) => document.getElementById(id);
+
+function fill(select, values) {
+  const known = [...select.options].map((option) => option.value);
+  if (known.length === values.length && known.every((value, i) => value === values[i])) return;
+  const chosen = select.value;
+  select.replaceChildren(...values.map((value) => new Option(value, value)));
+  if (values.includes(chosen)) select.value = chosen;
+}
+
+export class Controls {
+  /** @param {function} send sends a message of the page */
+  constructor(send) {
+    this._send = send;
+    this.refused = {};
+    this.connected = false;
+    this.session = { scene: '', method: '', recording: '', busy: '', scenes: [] };
+    this.state = { state: '', text: '', e_stopped: false };
+    this._lastScale = 0;
+    for (const op of ['start', 'pause', 'reset']) $(op).addEventListener('click', () => send({ op }));
+    $('record').addEventListener('click', () => send({ op: 'record', on: !this.session.recording }));
+    for (const id of ['scene', 'method']) $(id).addEventListener('change', () => this._choose());
+    $('scale').addEventListener('input', () => this._scale(false));
+    $('scale').addEventListener('change', () => this._scale(true));
+    this._hints = Object.fromEntries(['start', 'pause', 'reset', 'record'].map((id) => [id, $(id).title]));
+  }
+
+  begin(hello) {
+    this._scenes = hello.scenes;
+    fill($('scene'), hello.scenes);
+    fill($('method'), hello.methods);
+    this.showSession(this.session);
+  }
+
+  showState(state) {
+    this.state = state;
+    const [sign, name] = state.e_stopped ? ['■', 'E-STOP'] : STATES[state.state] ?? ['…', 'WAITING'];
+    $('state').dataset.state = state.e_stopped ? 'E_STOP' : state.state;
+    $('state-name').textContent = `${sign} ${name}`;
+    $('state-text').textContent = state.text || (state.state ? '' : 'Waiting for the haptic bridge.');
+    this.enable();
+  }
+
+  showSession(session) {
+    this.session = session;
+    const scenes = session.scenes?.length ? session.scenes : this._scenes ?? [];
+    fill($('scene'), scenes.includes(session.scene) || !session.scene ? scenes : [...scenes, session.scene]);
+    if (session.scene) $('scene').value = session.scene;
+    if (session.method) $('method').value = session.method;
+    const recording = Boolean(session.recording);
+    $('record').textContent = recording ? 'Stop recording' : 'Record';
+    $('record').setAttribute('aria-pressed', String(recording));
+    $('busy').hidden = !session.busy && !recording;
+    $('busy').classList.toggle('recording', recording && !session.busy);
+    $('busy').textContent = session.busy || `Recording ${session.recording}`;
+    this.enable();
+  }
+
+  showScale({ value, min, max }) {
+    const slider = $('scale');
+    [slider.min, slider.max] = [min, max];
+    if (document.activeElement !== slider || performance.now() - this._lastScale > 500) slider.value = value;
+    $('scale-value').textContent = Number(value).toFixed(2).replace(/0$/, '');
+  }
+
+  showNodes(rows) {
+    const body = $('nodes');
+    while (body.rows.length > rows.length) body.deleteRow(-1);
+    rows.forEach((row, index) => {
+      const shown = body.rows[index] ?? newRow(body);
+      const [sign, word] = LEVELS[row.level] ?? LEVELS[3];
+      const texts = [sign, row.name, row.rate ? `${Math.round(row.rate)} Hz` : '', row.message];
+      shown.className = `level-${word}`;
+      shown.cells[0].setAttribute('aria-label', word);
+      texts.forEach((text, column) => {
+        if (shown.cells[column].textContent !== text) shown.cells[column].textContent = text;
+      });
+    });
+  }
+
+  showMoment(moment) {
+    $('hud').hidden = false;
+    $('hud-force').textContent = Math.hypot(...moment.force).toFixed(2);
+    $('hud-depth').textContent = (1000 * moment.depth).toFixed(1);
+    $('hud-contact').textContent = CONTACTS[moment.contact] ?? '';
+  }
+
+  /** Disables requests that the server would refuse, and all without a connection. */
+  enable() {
+    const why = (op) => (this.connected ? this.refused[op] ?? '' : 'There is no connection.');
+    const stand = (id, op, more = '') => {
+      const reason = why(op) || more;
+      $(id).disabled = Boolean(reason);
+      $(id).title = reason || this._hints[id] || '';
+    };
+    const { state } = this.state;
+    stand('start', 'start', state === 'ENABLED' ? 'The force is on.' : '');
+    stand('pause', 'pause', state === 'PAUSED' ? 'It is paused.' : '');
+    stand('reset', 'reset');
+    stand('record', 'record');
+    stand('scene', 'choose');
+    stand('method', 'choose');
+    stand('scale', 'scale');
+  }
+
+  _choose() {
+    this._send({ op: 'choose', scene: $('scene').value, method: $('method').value });
+    this.showSession(this.session); // until the server confirms the choice
+  }
+
+  _scale(last) {
+    const now = performance.now();
+    clearTimeout(this._scaleTimer);
+    if (!last && now - this._lastScale < SCALE_MS) {
+      this._scaleTimer = setTimeout(() => this._scale(true), SCALE_MS);
+      return;
+    }
+    this._lastScale = now;
+    this._send({ op: 'scale', value: Number($('scale').value) });
+  }
+}
+
+function newRow(body) {
+  const row = body.insertRow();
+  for (let i = 0; i < 4; i += 1) row.insertCell();
+  return row;
+}
