@@ -96,8 +96,8 @@ class Resimulation:
         except FAILURES as error:
             return f'the cut of frame {asked.step} was made, and fails now: {error}'
         if result.delta.empty != (outcome is CutOutcome.EMPTY):
-            done = ('something', 'nothing')[outcome is CutOutcome.EMPTY]
-            return f'the cut of frame {asked.step} changed {done}, and does not so now'
+            then, now = ('something', 'nothing') if result.delta.empty else ('nothing', 'something')
+            return f'the cut of frame {asked.step} changed {then}, and changes {now} now'
         self._resolve(outcome, result)
         return ''
 

@@ -79,7 +79,7 @@ def docstrings() -> Iterator[tuple[str, ast.AST, str]]:
 
 
 def what_clauses() -> tuple[int, int]:
-    """Return how often docstrings say "what", and how many words they have."""
+    """Return how often docstrings say the word, and how many words they have."""
     words = [word.lower() for _, _, text in docstrings() for word in WORD.findall(text)]
     return words.count('what'), len(words)
 

@@ -24,7 +24,7 @@ class Check:
     """One check.
 
     Attributes:
-        name: what the user sees.
+        name: shown to the user.
         argv: its command.
         repetitions: largest number of further runs of the tests that failed.
     """

@@ -27,7 +27,7 @@ class Number:
     Attributes:
         value: in the unit of the scene key.
         how: way in which it was had.
-        source: paper, DOI and table, and what was made of them.
+        source: paper, DOI and table, and how they were converted.
     """
 
     value: float

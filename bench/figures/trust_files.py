@@ -12,7 +12,7 @@ from bench.files.hostile_files import HOSTILE_YAML
 from cutting_trainer.cli import bags as commands_bags
 from cutting_trainer.recordings import html_report, picture, repair, resimulate
 
-SAMPLE = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_2' / 'palpation'
+SAMPLE = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_4' / 'palpation'
 TOPICS = ('/tissue/mesh', '/tissue/force', '/tool/contact')
 COPIES = 36
 MESSAGES, IN_CHUNK = 120, 10

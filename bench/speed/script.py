@@ -30,7 +30,7 @@ _MS = 1_000_000
 
 @dataclass
 class Frames:
-    """What was measured in each frame.
+    """Measured result of each frame.
 
     Attributes:
         phase: of the script.
@@ -40,7 +40,7 @@ class Frames:
         inside: whether the blade is in the tissue.
         lag: from the device's edge to the one in the tissue [m].
         slow: simulated time over frame time.
-        trouble: what was said.
+        trouble: warnings.
         active: points where the law counts, heavier nodes, their mass over the whole.
     """
 
@@ -96,7 +96,7 @@ def run_script(name: str, changes: dict[str, str]) -> tuple[Frames, list[str]]:
         changes: of the scene, by dotted key.
 
     Returns:
-        The frames, and sentences on what was cut.
+        The frames, and sentences on the cuts.
     """
     scene = load_scene(name)
     with tempfile.TemporaryDirectory() as folder:

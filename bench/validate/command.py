@@ -56,7 +56,7 @@ def run_validate(
 
 
 def content(results: Results) -> dict[str, object]:
-    """Return what the JSON output has."""
+    """Return the content of the JSON output."""
     cases = []
     for name, rows in results.items():
         case = CASES[name]

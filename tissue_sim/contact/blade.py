@@ -314,7 +314,7 @@ class Blade:
         return True
 
     def _settle(self, stiffness: float, cuts: np.ndarray) -> None:
-        """Update what others see: force, torque, limit, and the edge as a line."""
+        """Update the output: force, torque, limit, and the edge as a line."""
         self.force, self.torque, self.limit, self.lag = np.zeros(3), np.zeros(3), 0.0, 0.0
         count = len(self._corners)
         self.immersed = count * self._piece()

@@ -193,7 +193,7 @@ def _third_of_angle(c):
 
 @inner(error_model='numpy', inline='always')
 def tangent_modulus(h0, h1, h2, h3, h4, h5, h6, h7, h8, a, c, lam, b):
-    """Compute what `tangent_bound` does, without a branch.
+    """Compute the modulus of `tangent_bound` without a branch.
 
     Args:
         h0, h1, h2, h3, h4, h5, h6, h7, h8: displacement gradient, by rows.
@@ -219,7 +219,7 @@ def tangent_modulus(h0, h1, h2, h3, h4, h5, h6, h7, h8, a, c, lam, b):
     off = c01 * c01 + c02 * c02 + c12 * c12
     size = math.sqrt((d0 * d0 + d1 * d1 + d2 * d2 + 2.0 * off) / 6.0)
     det = d0 * (d1 * d2 - c12 * c12) - c01 * (c01 * d2 - c12 * c02) + c02 * (c01 * c12 - d1 * c02)
-    scale = max(size, 1e-9 * mean)
+    scale = max(size, 1e-9 * mean + 1e-30)  # above 0 without volume, too
     half = 0.5 * det / (scale * scale * scale)  # from -1 to 1, but for rounding
     high = mean + 2.0 * size * _third_of_angle(math.sqrt(abs(0.5 + 0.5 * half)))
     low = _above_zero(mean - 2.0 * size * _third_of_angle(math.sqrt(abs(0.5 - 0.5 * half))))
