@@ -209,7 +209,17 @@ def settled(
     """Return the model, its displacement [m], shape (n, 3), and the force of the motion [J]."""
     material = Material(5400.0, nu, 1060.0, stiffening=stiffening)
     elastic = ElasticModel(mesh, material, model, tolerance)
-    held = mesh.fixed == 1
+    u = followed(case, elastic)
+    return elastic, u, _force(case, elastic, u)
+
+
+def followed(case: Case, elastic: ElasticModel) -> Floats:
+    """Return the displacement of a model at the end of the motion [m], shape (n, 3).
+
+    Raises:
+        MeshError: no equilibrium was found on the way.
+    """
+    mesh, held = elastic.mesh, elastic.mesh.fixed == 1
     none = np.zeros_like(mesh.rest)
     done, u, part = 0.0, none, 1 / (2 * case.steps)
     rate = none  # of the displacement, by share of the load
@@ -228,9 +238,7 @@ def settled(
             continue
         rate = (found - u) / (share - done)
         done, u = share, found
-    d = 1e-6
-    rate = (case.motion(mesh.rest, 1 + d) - case.motion(mesh.rest, 1 - d)) / (2 * d)
-    return elastic, u, float((elastic.force(u) * rate)[held].sum())
+    return u
 
 
 def compared(
@@ -247,9 +255,29 @@ def compared(
         model: name.
     """
     mesh = unstructured_block(case, edge, seed)
-    elastic, u, force = settled(case, mesh, nu, block.solid.stiffening, model=model)
+    elastic, u, _ = settled(case, mesh, nu, block.solid.stiffening, model=model)
+    return errors_at(case, block, elastic, u)
+
+
+def errors_at(case: Case, block: LawBlock, elastic: ElasticModel, u: Floats) -> LawError:
+    """Return the error of a model at the end of the motion.
+
+    Args:
+        case: of the motion.
+        block: its reference.
+        elastic: the model.
+        u: its displacement [m], shape (n, 3).
+    """
+    mesh = elastic.mesh
     right = block.at(mesh.rest)
     weight = elastic.mass[:, None]
     field = np.sqrt((weight * (u - right) ** 2).sum() / (weight * right**2).sum())
     exact = block.force(case.motion, 1.0)
-    return LawError(len(mesh.tetrahedra), force / exact - 1, float(field))
+    return LawError(len(mesh.tetrahedra), _force(case, elastic, u) / exact - 1, float(field))
+
+
+def _force(case: Case, elastic: ElasticModel, u: Floats) -> float:
+    """Return the force of the motion at its end [J]."""
+    mesh, d = elastic.mesh, 1e-6
+    rate = (case.motion(mesh.rest, 1 + d) - case.motion(mesh.rest, 1 - d)) / (2 * d)
+    return float((elastic.force(u) * rate)[mesh.fixed == 1].sum())

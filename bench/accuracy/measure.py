@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.accuracy.problems import AfterCut, Problem, Rest, material, static_problems
+from bench.accuracy.problems import AfterCut, Problem, Rest, static_problems
 from bench.accuracy.region import LocalPalpation, describe
 from bench.accuracy.vibration import Vibration
 from bench.common.meshes import kuhn_block
@@ -92,7 +92,7 @@ def _timed(
         dynamics.displacement[free] = rest.displacement[free]
         dynamics.velocity[free] = _WAKING_VELOCITY
     else:
-        dynamics = Dynamics(rest.model.mesh, material(problem.solid), model, stepping)
+        dynamics = Dynamics(rest.model.mesh, rest.model.material, model, stepping)
         dynamics.displacement[:] = rest.displacement
     cost, step, substeps = cpu_per_second(dynamics)
     return Point(

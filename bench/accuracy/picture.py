@@ -13,6 +13,7 @@ _COLOURS = {
     'linear_smoothed': '#66ccee',
     'corotational': '#cc6677',
     'corotational_smoothed': '#882255',
+    'stiffening': '#228833',
 }
 _REGIONS = {'off': 'o', 'on': '^', 'budget': 's'}
 _JOINED = 'front: nothing is\ncheaper and nearer'

@@ -3,13 +3,22 @@
 Each is small enough to be solved on a desk and has a reference of its own (`chart_reference`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.accuracy.law_problems import (
+    CASES,
+    SIDE,
+    errors_at,
+    followed,
+    solved_reference,
+    unstructured_block,
+)
+from bench.accuracy.law_reference import LawBlock
 from bench.accuracy.reference import (
     Converged,
     ExactBeam,
@@ -30,6 +39,7 @@ from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.presets import PRESETS
 
 Floats = NDArray[np.float64]
 
@@ -344,7 +354,41 @@ class AfterCut:
         return Rest(elastic, u, Errors(abs(opening / width - 1), abs(pull / force - 1)))
 
 
-Problem = Indentation | Cantilever | LargeRotation | AfterCut
+class LargeStrain:
+    """A cube of human liver between clamps, pressed by 30 %; nodes are scattered, not in rows."""
+
+    name = 'large_strain'
+    title = 'Large strain: a cube that stiffens, pressed by 30 %'
+    reference_name = 'scikit-fem, quadratic hexahedra with the law that stiffens'
+    resolutions = (4, 6, 8)
+    solid = Solid((SIDE, SIDE, SIDE), 5400.0, 0.47)
+    _case = CASES['press 30 %']
+    _seed = 1
+
+    @property
+    def _stiffening(self) -> float:
+        return PRESETS['liver_human'].numbers['stiffening'].value
+
+    @cached_property
+    def reference(self) -> LawBlock:
+        """The pressed cube."""
+        return solved_reference(self._case, self.solid.poissons_ratio, self._stiffening)
+
+    def rest(self, model: ModelName, resolution: int) -> Rest:
+        """Return the cube, with so many edges over its height, at rest between the clamps."""
+        mesh = unstructured_block(self._case, SIDE / resolution, self._seed)
+        stiff = replace(material(self.solid), stiffening=self._stiffening)
+        elastic = ElasticModel(mesh, stiff, model)
+        if model.startswith('linear'):
+            start = np.where(mesh.fixed[:, None] == 1, self._case.motion(mesh.rest, 1.0), 0.0)
+            u = equilibrium(elastic, np.zeros_like(start), start=start)
+        else:
+            u = followed(self._case, elastic)
+        found = errors_at(self._case, self.reference, elastic, u)
+        return Rest(elastic, u, Errors(found.field, abs(found.force)))
+
+
+Problem = Indentation | Cantilever | LargeRotation | AfterCut | LargeStrain
 
 
 def static_problems() -> tuple[Problem, ...]:
@@ -356,4 +400,5 @@ def static_problems() -> tuple[Problem, ...]:
         Cantilever(0.49),
         LargeRotation(),
         AfterCut(),
+        LargeStrain(),
     )
