@@ -41,8 +41,8 @@ def reasons_off_front(points: list[Point], problem: str, method: tuple[str, str]
     """Return the reasons why a method is not on the front of a problem; none: it is.
 
     No method may beat it on any mesh, and one of its meshes must be on the front of all. To beat it
-    is to be faster and as near, at rest and in free vibration: nothing moves in the other panels, so
-    they do not show that a long implicit step damps what does.
+    is to be faster and as near, at rest and in free vibration. Nothing moves in the other panels:
+    they do not show that a long implicit step damps motion.
 
     Args:
         points: of the chart.

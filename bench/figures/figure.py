@@ -36,8 +36,8 @@ class Figure:
     def passes(self) -> bool:
         """Return whether the value keeps the bound; NaN keeps none."""
         if self.side == 'at most':
-            return self.value <= self.bound
-        return self.value >= self.bound
+            return bool(self.value <= self.bound)
+        return bool(self.value >= self.bound)
 
 
 def figures_of(name: str) -> list[Figure]:

@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.elasticity.corotational import KEPT, SLOTS, chunk_deformation
-from cutting_trainer.tissue_sim.elasticity.rotation import LANES, SAFE_MATH
+from cutting_trainer.tissue_sim.elasticity.corotational import KEPT, chunk_deformation
+from cutting_trainer.tissue_sim.elasticity.rotation import LANES, SAFE_MATH, SLOTS
 from cutting_trainer.tissue_sim.elasticity.stiffening import (
     MAX_EXPONENT,
     MAX_OWN_EXPONENT,
@@ -213,15 +213,15 @@ def _gather(elements, groups, u, mu, chunk, shapes):
         V, C = elements.data[at + 13 * L :], elements.corners[corner:]
         E1, S1 = chunk[low:], shapes[low:]
         for b in range(GROUP):
-            i, j = np.uint32(C[b]), np.uint32(C[L + b])
-            k, m = np.uint32(C[2 * L + b]), np.uint32(C[3 * L + b])
-            x, y, z = u[i], u[i + _U1], u[i + _U2]
+            n0, n1 = np.uint32(C[b]), np.uint32(C[L + b])
+            n2, n3 = np.uint32(C[2 * L + b]), np.uint32(C[3 * L + b])
+            x, y, z = u[n0], u[n0 + _U1], u[n0 + _U2]
             E1[VOLUME * L + b] = scale * V[b]
-            S1[9 * L + b], S1[10 * L + b] = u[j] - x, u[j + _U1] - y
-            S1[11 * L + b], S1[12 * L + b] = u[j + _U2] - z, u[k] - x
-            S1[13 * L + b], S1[14 * L + b] = u[k + _U1] - y, u[k + _U2] - z
-            S1[15 * L + b], S1[16 * L + b] = u[m] - x, u[m + _U1] - y
-            S1[17 * L + b] = u[m + _U2] - z
+            S1[9 * L + b], S1[10 * L + b] = u[n1] - x, u[n1 + _U1] - y
+            S1[11 * L + b], S1[12 * L + b] = u[n1 + _U2] - z, u[n2] - x
+            S1[13 * L + b], S1[14 * L + b] = u[n2 + _U1] - y, u[n2 + _U2] - z
+            S1[15 * L + b], S1[16 * L + b] = u[n3] - x, u[n3 + _U1] - y
+            S1[17 * L + b] = u[n3 + _U2] - z
     for b in range(groups.shape[0] * GROUP, L):
         E[b + VOLUME * L] = 0.0
     for j in range(3):
@@ -249,23 +249,23 @@ def _scatter(elements, groups, chunk, shapes, f):
         corner = 4 * (tet // L) * L + tet % L
         C, S1 = elements.corners[corner:], shapes[low + 9 * L :]
         for b in range(GROUP):
-            i, j = np.uint32(C[b]), np.uint32(C[L + b])
-            k, m = np.uint32(C[2 * L + b]), np.uint32(C[3 * L + b])
+            n0, n1 = np.uint32(C[b]), np.uint32(C[L + b])
+            n2, n3 = np.uint32(C[2 * L + b]), np.uint32(C[3 * L + b])
             x0, y0, z0 = S1[b], S1[L + b], S1[2 * L + b]
             x1, y1, z1 = S1[3 * L + b], S1[4 * L + b], S1[5 * L + b]
             x2, y2, z2 = S1[6 * L + b], S1[7 * L + b], S1[8 * L + b]
-            f[i] -= x0 + x1 + x2
-            f[i + _U1] -= y0 + y1 + y2
-            f[i + _U2] -= z0 + z1 + z2
-            f[j] += x0
-            f[j + _U1] += y0
-            f[j + _U2] += z0
-            f[k] += x1
-            f[k + _U1] += y1
-            f[k + _U2] += z1
-            f[m] += x2
-            f[m + _U1] += y2
-            f[m + _U2] += z2
+            f[n0] -= x0 + x1 + x2
+            f[n0 + _U1] -= y0 + y1 + y2
+            f[n0 + _U2] -= z0 + z1 + z2
+            f[n1] += x0
+            f[n1 + _U1] += y0
+            f[n1 + _U2] += z0
+            f[n2] += x1
+            f[n2 + _U1] += y1
+            f[n2 + _U2] += z1
+            f[n3] += x2
+            f[n3 + _U1] += y2
+            f[n3 + _U2] += z2
 
 
 @kernel(error_model='numpy')

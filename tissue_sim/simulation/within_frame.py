@@ -74,7 +74,8 @@ class ToolInFrame:
         """
         if self.blade is None and self._punctures(share, positions):
             hint = int(self._mesh.star(int(self._contact.nodes[0]))[0])
-            self.blade = Blade(self._resistance, *self._device(share), hint)
+            root, tip = self._device(share)
+            self.blade = Blade(self._resistance, root, tip, hint)
         if self.blade is not None:
             self.blade.carry(positions)
             self._follow(share, positions)
