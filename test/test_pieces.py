@@ -95,3 +95,18 @@ def test_attached_tissue_and_unused_nodes_are_no_pieces():
     assert free_parts(tissue).tolist() == [0, 0, 0, 0]
     tissue.fixed[:] = 0
     assert free_parts(tissue).tolist() == [1, 1, 1, 1]
+
+
+def test_a_cut_may_take_nodes_back():
+    mesh = held_at_its_sides()
+    excise(mesh, (0.0, 0.0), 0.01, 0.3)
+    register = PieceRegister(mesh)
+    used = int(mesh.tetrahedra.max()) + 1
+    longer = SimpleNamespace(
+        rest=np.vstack([mesh.rest, np.zeros((3, 3))]),
+        tetrahedra=mesh.tetrahedra,
+        fixed=np.append(mesh.fixed, np.zeros(3, np.uint8)),
+    )
+    assert used == len(mesh.rest)
+    assert register.find_new(longer, longer.rest) == []
+    assert register.find_new(mesh, mesh.rest) == []

@@ -64,11 +64,12 @@ class PieceRegister:
         """Return the pieces that came off since the last call.
 
         Args:
-            tissue: now; nodes keep their indices, new ones follow.
+            tissue: now; nodes keep their indices. New ones follow, and a cut may take the last ones back.
             positions: of its nodes [m], shape (n, 3).
         """
         known = np.zeros(len(tissue.rest), np.int64)
-        known[: len(self._label)] = self._label
+        both = min(len(known), len(self._label))
+        known[:both] = self._label[:both]
         part = free_parts(tissue)
         self._label = np.zeros_like(known)
         new: list[int] = []
