@@ -64,7 +64,7 @@ class PieceRegister:
         """Return the pieces that came off since the last call.
 
         Args:
-            tissue: now; nodes keep their indices. New ones follow, and a cut may take the last ones back.
+            tissue: now; nodes keep their indices, new ones follow; a cut may take the last back.
             positions: of its nodes [m], shape (n, 3).
         """
         known = np.zeros(len(tissue.rest), np.int64)
