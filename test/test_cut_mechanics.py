@@ -93,13 +93,13 @@ def test_a_notch_cut_through_elements_opens_like_a_slit_to_two_per_cent(
 ) -> None:
     """Against another mesh of the same resolution, made with its slit, at the same area of slit.
 
-    Where the front ends inside elements it goes to points of their faces: the notch is up to a
-    part of an element deeper or less deep than the blade went, and its area says by how much.
+    Where the front ends inside elements it goes to points of their faces: the notch is up to half
+    an edge deeper or less deep than the blade went, and its area says by how much.
     """
     nodes, tets = irregular_box(CELLS, SIZE, 1, jitter=0.1)
     model = notched(nodes, tets, MIDDLE + aside * SIZE, DEPTH + deeper * SIZE)
     area, force, opening = pulled(model)
-    assert area == pytest.approx(WIDTH * (DEPTH + deeper * SIZE), abs=0.3 * WIDTH * SIZE)
+    assert area == pytest.approx(WIDTH * (DEPTH + deeper * SIZE), abs=0.45 * WIDTH * SIZE)
     slits = np.array([with_slit(layers) for layers in range(7, 11)])
     assert force == pytest.approx(np.interp(area, slits[:, 0], slits[:, 1]), rel=0.02)
     assert opening == pytest.approx(np.interp(area, slits[:, 0], slits[:, 2]), rel=0.02)

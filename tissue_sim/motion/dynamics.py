@@ -314,7 +314,8 @@ class Dynamics:
         size = 3 * self.mesh.node_count
         moving = self._v[:size]
         calm = self.loads is None or self.loads.settled
-        if tool is None and calm and float(np.abs(moving).max()) < _AT_REST:
+        free = tool is None and coupling.mode == FREE
+        if free and calm and float(np.abs(moving).max()) < _AT_REST:
             # Decay would continue into denormal numbers, at a hundred times the cost.
             if self._still >= _STILL_FRAMES:
                 moving[:] = 0.0
