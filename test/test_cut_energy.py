@@ -17,7 +17,7 @@ from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 pytestmark = pytest.mark.long
 
-TOUGHNESS, RATE = 40.0, 500.0
+TOUGHNESS, RATE, EDGE = 40.0, 500.0, 0.0025
 MATERIAL = Material(30000.0, 0.4, 1000.0, 5.0, 2e-4)
 
 
@@ -81,7 +81,8 @@ REVERSED = (*ENTRY, (0.030, 0.0138, 0.0112), (0.0235, 0.0138, 0.0112), (0.037, 0
     ],
 )
 def test_the_work_of_the_blade_is_accounted_for_within_five_per_cent(stops) -> None:
-    nodes, tets = irregular_box((24, 10, 8), 0.0025, 3, jitter=0.1)
+    """The cut is led on by half an edge or so to where the blade ends: nothing is paid there."""
+    nodes, tets = irregular_box((24, 10, 8), EDGE, 3, jitter=0.1)
     stroke = Stroke(
         TissueSimulation(
             TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
@@ -96,6 +97,7 @@ def test_the_work_of_the_blade_is_accounted_for_within_five_per_cent(stops) -> N
     area = cut_area(stroke.simulation.mesh)
     assert area > 1.8e-4
     stored = frame.kinetic_energy + frame.elastic_energy
-    spent = TOUGHNESS * area + stroke.dissipated + stored
-    print(f'work {stroke.work:.3e} J, fracture {TOUGHNESS * area:.3e} J, stored {stored:.3e} J')
+    paid = TOUGHNESS * (area - 0.5 * EDGE * (8 * EDGE - stops[-1][2]))
+    spent = paid + stroke.dissipated + stored
+    print(f'work {stroke.work:.3e} J, fracture {paid:.3e} J, stored {stored:.3e} J')
     assert stroke.work == pytest.approx(spent, rel=0.05)
