@@ -1,5 +1,6 @@
 """Commands of the trainer on files, each in a process: status, output, memory, time."""
 
+import gc
 import os
 import resource
 import sys
@@ -61,6 +62,7 @@ def run(arguments: Sequence[str], timeout: int = 60) -> CommandResult:
         before, began = _idle_peak(), time.monotonic()
         child = os.fork()
         if child == 0:
+            gc.freeze()  # what this process left of ROS cannot be collected without its threads
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.alarm(timeout)
             os.dup2(out.fileno(), 1)
