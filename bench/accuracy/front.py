@@ -5,7 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bench.accuracy.measure import EQUAL_ERROR_RATIO, Point
+from bench.accuracy.measure import EQUAL_ERROR_RATIO, Point, is_beaten
 from bench.accuracy.vibration import Vibration
 from cutting_trainer.session.scene import SCENES, load_scene
 from cutting_trainer.tissue_sim.settings import TissueSettings
@@ -56,12 +56,8 @@ def reasons_off_front(points: list[Point], problem: str, method: tuple[str, str]
         return ['it has not been measured there']
 
     def beaten_by(p: Point, other: Point) -> bool:
-        return (
-            other.cpu_per_second < p.cpu_per_second
-            and other.displacement_error < EQUAL_ERROR_RATIO * p.displacement_error
-            and moving.get(other.integrator, 0.0)
-            <= EQUAL_ERROR_RATIO * moving.get(p.integrator, 0.0)
-        )
+        damping, own_damping = (moving.get(q.integrator, 0.0) for q in (other, p))
+        return is_beaten(p, other) and damping <= EQUAL_ERROR_RATIO * own_damping
 
     found = [
         f'{other.model} by {other.integrator} is faster and as near with {p.tetrahedra} tetrahedra'

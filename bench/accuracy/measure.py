@@ -189,15 +189,18 @@ def _palpation(
 
 def with_front(points: list[Point]) -> list[Point]:
     """Return the same points of one problem, with those on the front marked as such."""
+    return [
+        replace(point, front=not any(is_beaten(point, other) for other in points))
+        for point in points
+    ]
 
-    def beaten(point: Point) -> bool:
-        return any(
-            other.cpu_per_second < point.cpu_per_second
-            and other.displacement_error < EQUAL_ERROR_RATIO * point.displacement_error
-            for other in points
-        )
 
-    return [replace(point, front=not beaten(point)) for point in points]
+def is_beaten(point: Point, other: Point) -> bool:
+    """Return whether another point of the same problem is cheaper, and as near or nearer."""
+    return (
+        other.cpu_per_second < point.cpu_per_second
+        and other.displacement_error < EQUAL_ERROR_RATIO * point.displacement_error
+    )
 
 
 def reference_cost() -> float:
