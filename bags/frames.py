@@ -11,6 +11,7 @@ import numpy as np
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.order import Sequence
 from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.tissue import first_current_keyframe
 from cutting_trainer.bags.topics import CONTACT, FORCE, INPUTS, MESH, POSE, of_session
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
@@ -233,12 +234,11 @@ def first_keyframe(bag: Bag) -> Any:
     Raises:
         BagError: it has none.
     """
-    first = None
     for recorded in bag.messages([MESH]):
         mesh = bag.read(recorded)
         if mesh.step == 0:
             return mesh
-        first = first or mesh
-    if first is None:
+    current = first_current_keyframe(bag)
+    if current is None:
         raise BagError(f'{bag.path} has no message of {MESH}: there is no tissue to compute')
-    return first
+    return bag.read(current)

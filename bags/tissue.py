@@ -1,8 +1,10 @@
 """The recorded tissue at a moment of the session."""
 
+from collections.abc import Iterator
+
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.player import first_time
-from cutting_trainer.bags.reader import Bag
+from cutting_trainer.bags.reader import Bag, Recorded
 from cutting_trainer.bags.topics import MESH, UPDATES
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
@@ -19,7 +21,7 @@ def tissue_at(bag: Bag, seconds: float | None = None) -> MeshReplica:
     """
     replica = MeshReplica()
     origin = first_time(bag)
-    for recorded in bag.messages([MESH, UPDATES]):
+    for recorded in tissue_messages(bag):
         if seconds is not None and recorded.log_time - origin > seconds * 1e9:
             break
         follow(replica, recorded.topic, bag.read(recorded))
@@ -29,9 +31,33 @@ def tissue_at(bag: Bag, seconds: float | None = None) -> MeshReplica:
     return replica
 
 
+def first_current_keyframe(bag: Bag) -> Recorded | None:
+    """Return the first keyframe that the recorded deltas continue; None where there is no keyframe.
+
+    A recorder that joins a session first receives the keyframe that was published last. Cuts since
+    then are not in it, and no recorded delta fits it. Where no keyframe fits, this is the first.
+    """
+    delta = next(iter(bag.messages([UPDATES])), None)
+    base = 0 if delta is None else bag.read(delta).base_revision
+    first = None
+    for keyframe in bag.messages([MESH]):
+        first = first or keyframe
+        if bag.read(keyframe).revision >= base:
+            return keyframe
+    return first
+
+
+def tissue_messages(bag: Bag) -> Iterator[Recorded]:
+    """Yield keyframes and deltas in their order, from the `first_current_keyframe` on."""
+    first = first_current_keyframe(bag)
+    if first is not None:
+        messages = bag.messages([MESH, UPDATES])
+        yield from (m for m in messages if m.log_time >= first.log_time)
+
+
 def first_tissue(bag: Bag) -> float:
     """Return the time of the first keyframe [s since the first message]; 0 where there is none."""
-    first = next(iter(bag.messages([MESH])), None)
+    first = first_current_keyframe(bag)
     return 0.0 if first is None else (first.log_time - first_time(bag)) * 1e-9
 
 

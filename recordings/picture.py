@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import math
+
 import matplotlib as mpl
 import numpy as np
 from matplotlib.collections import PolyCollection
@@ -12,7 +14,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.tissue import follow
+from cutting_trainer.bags.tissue import first_current_keyframe, follow
 from cutting_trainer.bags.topics import CONTACT, MESH, SERVO_CF, UPDATES, of_session
 from cutting_trainer.haptic_bridge.chain import INSIDE, NONE
 from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
@@ -89,6 +91,9 @@ def read_story(bag: Path, at: float | None) -> Story:
     start, time = 0, 0.0
     opened = open_bag(bag)
     servo_cf = of_session(SERVO_CF, opened.topics())
+    first = first_current_keyframe(opened)
+    known_from = 0 if first is None else first.log_time
+    until = math.inf if at is None else at
     for message in opened.messages():
         start = start or message.log_time
         time = (message.log_time - start) * 1e-9
@@ -99,12 +104,12 @@ def read_story(bag: Path, at: float | None) -> Story:
         elif message.topic == servo_cf:
             norm = np.linalg.norm(wrenches.decode(message.data).values[force])
             forces.append([time, float(norm)])
-        elif message.topic in (MESH, UPDATES) and (at is None or time <= at):
+        elif message.topic in (MESH, UPDATES) and message.log_time >= known_from and time <= until:
             follow(story.replica, message.topic, opened.read(message))
     story.moment = time if at is None else min(at, time)
     if story.replica.revision < 0:
-        until = '' if at is None else f' in its first {at:g} s'
-        raise SessionError(f'{bag} has no message of {MESH}{until}: there is no tissue to draw')
+        span = '' if at is None else f' in its first {at:g} s'
+        raise SessionError(f'{bag} has no message of {MESH}{span}: there is no tissue to draw')
     story.tool = np.array(tool, float).reshape(-1, 11)
     story.forces = np.array(forces, float).reshape(-1, 2)
     return story

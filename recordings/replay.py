@@ -17,7 +17,8 @@ from cutting_trainer.bags.frames import first_keyframe
 from cutting_trainer.bags.player import Playhead, RecordedHand, duration
 from cutting_trainer.bags.player_node import HandPlayer, Player, SessionPlayer
 from cutting_trainer.bags.reader import Bag, open_bag
-from cutting_trainer.bags.topics import BUTTON, FORCES, MESH, OF_TISSUE, POSE, REPLAYED
+from cutting_trainer.bags.tissue import first_current_keyframe
+from cutting_trainer.bags.topics import BUTTON, FORCES, OF_TISSUE, POSE, REPLAYED
 from cutting_trainer.node_common.realtime import prepare
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.session.demo import new_bag
@@ -173,7 +174,7 @@ def tissue_in_the_middle(bag: Bag, folder: Path) -> Path | None:
         bag: bag of the session.
         folder: existing folder to write to.
     """
-    first = next(iter(bag.messages([MESH])), None)
+    first = first_current_keyframe(bag)
     if first is None or first_keyframe(bag).step == 0:
         return None
     path = folder / 'tissue.checkpoint'

@@ -17,8 +17,8 @@ from bench.page.open_page import OpenPage
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.player import duration
 from cutting_trainer.bags.reader import Bag, Recorded, open_bag
-from cutting_trainer.bags.tissue import tissue_at
-from cutting_trainer.bags.topics import CONTACT
+from cutting_trainer.bags.tissue import first_tissue, tissue_at
+from cutting_trainer.bags.topics import CONTACT, MESH, UPDATES
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 from cutting_trainer.recordings.picture import read_story
 from cutting_trainer.recordings.recorded_scene import restore_scene
@@ -81,6 +81,23 @@ def test_before_its_first_keyframe_a_bag_shows_that_one(bag: Bag) -> None:
     track = RecordedTissue(bag)
     track.go_to(duration(bag))
     assert track.go_to(-1.0).step == 0
+
+
+def test_a_keyframe_of_before_the_recording_is_not_shown(bag: Bag, tmp_path: Path) -> None:
+    """A recorder that joins a session first receives the keyframe that was published last."""
+    keyframes = list(bag.messages([MESH]))
+    late = keyframes[-1].log_time
+    assert len(keyframes) > 1
+
+    def change(m: Recorded) -> bytes | None:
+        between = keyframes[0].log_time < m.log_time < late
+        return None if between and m.topic in (MESH, UPDATES) else m.data
+
+    joined = open_bag(rewritten(bag.path.parent, tmp_path / 'joined', change))
+    at = (late - bag.span[0]) * 1e-9
+    assert RecordedTissue(joined).go_to(0.0).hash() == tissue_at(bag, at + 1e-6).hash()
+    assert first_tissue(joined) == pytest.approx(at)
+    assert read_story(joined.path.parent, None).replica.hash() == tissue_at(bag).hash()
 
 
 def test_session_computed_again_is_the_recorded_one_at_every_moment(

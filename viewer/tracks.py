@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.player import first_time
 from cutting_trainer.bags.reader import Bag, Recorded
-from cutting_trainer.bags.tissue import follow
-from cutting_trainer.bags.topics import CONTACT, FORCE, MESH, POSE, SERVO_CF, UPDATES, of_session
+from cutting_trainer.bags.tissue import follow, tissue_messages
+from cutting_trainer.bags.topics import CONTACT, FORCE, MESH, POSE, SERVO_CF, of_session
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
@@ -39,7 +39,7 @@ class RecordedTissue:
     def __init__(self, bag: Bag) -> None:
         origin = first_time(bag)
         self._bag = bag
-        self._messages: list[Recorded] = list(bag.messages([MESH, UPDATES]))
+        self._messages: list[Recorded] = list(tissue_messages(bag))
         self._times = np.array([(m.log_time - origin) * 1e-9 for m in self._messages])
         self._keyframes = np.array(
             [i for i, m in enumerate(self._messages) if m.topic == MESH], np.int64
