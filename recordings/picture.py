@@ -1,10 +1,9 @@
 """Picture of a recorded session: the tissue at one moment, the path of the tool, the force."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import math
 
 import matplotlib as mpl
 import numpy as np
