@@ -55,6 +55,10 @@ _REVIEW_PERIOD_S = 1.0
 _FLUSH_PERIOD_S = 0.2
 _INPUTS_TIMEOUT_S = 5.0
 """Time after which the recorder subscribes to states, with or without the inputs of frames."""
+_STATE_TIMEOUT_S = 3.0
+"""Time for which a recorder that is to end waits for the states that it has asked for."""
+_DISCOVERY_TIMEOUT_S = 1.0
+"""Time after which a topic that was not discovered has no publisher."""
 _QUEUE_DEPTH = 1000
 """Messages in the queue of a topic: a second of a 1 kHz stream."""
 
@@ -190,6 +194,26 @@ class Recorder(ManagedNode):
                 if now >= due[act]:
                     due[act] = now + period
                     act()
+        self._await_states()
+
+    def _await_states(self) -> None:
+        """Record until the states have arrived, or until it is clear that none will.
+
+        Without a state, nothing in a bag that begins within a session can be computed again.
+        """
+        deadline = time.monotonic() + _STATE_TIMEOUT_S
+        while not self._has_states() and time.monotonic() < deadline:
+            time.sleep(_DISCOVERY_PERIOD_S)
+            self.discover()
+            self.drain()
+
+    def _has_states(self) -> bool:
+        """Return whether the state of every node that publishes one has been received."""
+        offered = [topic for topic in self._states if self.count_publishers(topic)]
+        if not offered:
+            return time.monotonic() - self._begun > _DISCOVERY_TIMEOUT_S
+        streams = [self._streams.get(topic) for topic in offered]
+        return all(stream is not None and stream.counter.received > 0 for stream in streams)
 
     def rest(self) -> None:
         """Record the received messages, and ignore later ones."""

@@ -47,6 +47,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
                 return bool(raw and ContactCodec().decode(raw).values[state][0])
 
             wait_for(touches, 'the tool to touch')
+        record_shortly(folder / 'short', scene, domain)
         late = folder / 'late'
         words = ['-o', str(late), '--scene', str(scene), '--domain', str(domain)]
         recorder = subprocess.Popen(
@@ -60,6 +61,23 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield late
     finally:
         session.clean()
+
+
+def record_shortly(bag: Path, scene: Path, domain: str | int) -> None:
+    """Record from now on, and end as soon as the recorder is ready."""
+    words = ['-o', str(bag), '--scene', str(scene), '--domain', str(domain)]
+    recorder = subprocess.Popen(
+        [sys.executable, '-m', 'cutting_trainer.cli', 'record', *words],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert recorder.stdout is not None
+    assert any('recording into' in line for line in recorder.stdout)
+    recorder.send_signal(signal.SIGINT)
+    recorder.communicate(timeout=PATIENCE)
+    assert recorder.returncode == 0
 
 
 def ran(*words: str) -> int:
@@ -85,6 +103,13 @@ def test_a_bag_that_was_begun_in_a_stroke_is_computed_again_bit_for_bit(
     assert f'begins at frame {beginning.step}, ' in said
     computed = len(records) - (beginning.step - min(records))
     assert f'compared bit for bit: {computed} frames, {computed} forces' in said
+
+
+def test_a_recorder_that_ends_at_once_waits_for_the_state(bag: Path) -> None:
+    short = open_bag(bag.parent / 'short')
+    beginning = find_beginning(short)
+    assert beginning.tissue is not None
+    assert beginning.step > 1
 
 
 def test_it_is_reported_pictured_and_computed_with_another_tissue(
