@@ -420,6 +420,35 @@ def test_module_from_which_a_kernel_takes_constants_counts_as_a_kernel(
     assert {tree / 'cutting' / 'constants.py', kernel} <= set(launcher.kernel_files())
 
 
+def test_change_of_a_kernel_recompiles_what_imports_it_and_nothing_else(
+    launcher: Any, monkeypatch: pytest.MonkeyPatch, tree: Path
+) -> None:
+    used = 'from cutting_trainer.node_common.kernels import inner\n'
+    texts = {
+        'base': used,
+        'middle': f'{used}from cutting_trainer.cutting.base import f\n',
+        'top': f'{used}from cutting_trainer.cutting.middle import g\n',
+        'beside': used,
+    }
+    for name, text in texts.items():
+        (tree / 'cutting' / f'{name}.py').write_text(text)
+    home = launcher.find_home({})
+    folder = home.numba_cache / 'cutting_0123'
+    monkeypatch.setattr(launcher, 'run', lambda *_: None)
+
+    def kept_after_change(name: str) -> set[str]:
+        launcher.compile_kernels(home, 0)
+        folder.mkdir(parents=True, exist_ok=True)
+        for module in texts:
+            (folder / f'{module}.f-1.py311.nbi').touch()
+        os.utime(tree / 'cutting' / f'{name}.py', (1, 1))
+        launcher.compile_kernels(home, 0)
+        return {path.name.partition('.')[0] for path in folder.glob('*')}
+
+    assert kept_after_change('middle') == {'base', 'beside'}
+    assert kept_after_change('base') == {'beside'}
+
+
 BEFORE = {
     'make_environment': set(),
     'build_interfaces': {'make_environment'},
