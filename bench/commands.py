@@ -234,7 +234,7 @@ def chaos(
     """Kill and freeze nodes of a session at random: is the hand safe, does all come back?"""
     from bench.trials.chaos import ChaosOptions, run_chaos
 
-    options = ChaosOptions(scene, minutes, faults, seed, bag, parse_domain(domain), as_json)
+    options = ChaosOptions(scene, seed, parse_domain(domain), as_json, minutes, faults, bag)
     raise typer.Exit(int(run_chaos(options)))
 
 
@@ -263,7 +263,7 @@ def fuzz(
     """Send a session what nobody should send: does any node die, or pass it on?"""
     from bench.trials.fuzz import FuzzOptions, run_fuzz
 
-    options = FuzzOptions(scene, messages, flood, largest, seed, bag, parse_domain(domain), as_json)
+    options = FuzzOptions(scene, seed, parse_domain(domain), as_json, messages, flood, largest, bag)
     raise typer.Exit(int(run_fuzz(options)))
 
 
@@ -279,7 +279,7 @@ def soak(
     """Run session after session on the same processes: do memory, threads or handles grow?"""
     from bench.trials.soak import SoakOptions, run_soak
 
-    options = SoakOptions(scene, minutes, every, seed, parse_domain(domain), as_json)
+    options = SoakOptions(scene, seed, parse_domain(domain), as_json, minutes, every)
     raise typer.Exit(int(run_soak(options)))
 
 

@@ -1,15 +1,12 @@
 """`bench chaos`: run a session under random faults; check its safety and its recovery."""
 
-import json
 import signal
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from bench.trials.chaos_verdict import (
@@ -21,22 +18,14 @@ from bench.trials.chaos_verdict import (
     not_recovered,
 )
 from bench.trials.operator import FAULTS, Operator
+from bench.trials.trial import Running, TrialOptions, print_result, run_trial
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.session.demo import new_bag, report_failed_start
-from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import (
-    RECORDER_NODE,
-    node_environment,
-    recorder_command,
-    simulation_nodes,
-)
-from cutting_trainer.session.node_process import NodeCommand
-from cutting_trainer.session.progress import SessionProgress
+from cutting_trainer.session.demo import new_bag
+from cutting_trainer.session.graph import RECORDER_NODE, recorder_command, simulation_nodes
+from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.scene import Scene, load_scene
 from cutting_trainer.session.status import Status
-from cutting_trainer.session.supervisor import Event, Supervisor
-from cutting_trainer.session.terminal import session_console
 
 QUIET_TIME_S = 12.0
 """Time without faults before the first one and after the last [s]."""
@@ -49,40 +38,37 @@ MAX_NODES_DOWN = 2
 
 
 @dataclass(frozen=True)
-class ChaosOptions:
+class ChaosOptions(TrialOptions):
     """Options of `chaos`.
 
     Attributes:
-        scene: name or path.
         minutes: duration [min].
         faults: number of faults.
-        seed: seed of the faults.
         bag: folder of the new bag; None: a folder named after scene and time.
-        domain: ROS domain, or `free`.
-        as_json: print the outcome as JSON.
     """
 
-    scene: str
     minutes: float
     faults: int
-    seed: int
     bag: Path | None
-    domain: int | Literal['free']
-    as_json: bool
 
 
 class FaultInjector:
-    """Inject faults into the nodes of a supervisor at random times.
+    """Inject faults into the nodes of a session at random times.
 
     Args:
-        supervisor: supervisor of the nodes.
-        operator: operator that publishes the faults; it has the clock.
+        running: the session.
+        scene: scene of the nodes.
         options: number, seed and duration of the faults.
+
+    Attributes:
+        operator: operator that publishes the faults; it has the clock.
+        faults: faults that have ended.
     """
 
-    def __init__(self, supervisor: Supervisor, operator: Operator, options: ChaosOptions) -> None:
+    def __init__(self, running: Running, scene: Scene, options: ChaosOptions) -> None:
+        self.operator = operator = Operator(scene, running.domain, options.seed)
         self.faults: list[Fault] = []
-        self._supervisor, self._operator = supervisor, operator
+        self._supervisor = running.supervisor
         self._random = np.random.default_rng(options.seed)
         begin = operator.now + QUIET_TIME_S
         end = operator.now + 60 * options.minutes - QUIET_TIME_S
@@ -93,7 +79,7 @@ class FaultInjector:
 
     def tick(self, _elapsed: float) -> bool:
         """Inject faults that are due; return False after the last one and the time for recovery."""
-        now = self._operator.now
+        now = self.operator.now
         for name, (process, began, ends) in list(self._thaw.items()):
             if now >= ends:
                 del self._thaw[name]
@@ -109,8 +95,12 @@ class FaultInjector:
         """Register a node that is ready again."""
         if name in self._down:
             kind, began = self._down.pop(name)
-            self.faults.append(Fault(kind, name, began, self._operator.now))
-            self._over = self._operator.now + QUIET_TIME_S
+            self.faults.append(Fault(kind, name, began, self.operator.now))
+            self._over = self.operator.now + QUIET_TIME_S
+
+    def end(self) -> None:
+        """Leave the graph."""
+        self.operator.end()
 
     def unfinished(self) -> list[Fault]:
         """Return the faults of nodes that have not recovered at the end."""
@@ -124,11 +114,11 @@ class FaultInjector:
         name = str(self._random.choice(well))
         kinds: tuple[FaultKind, ...] = get_args(FaultKind)
         kind = kinds[self._random.choice(len(kinds), p=(0.4, 0.4, 0.2))]
-        self._operator.log_fault(f'{kind} {name}')
+        self.operator.log_fault(f'{kind} {name}')
         process = self._supervisor.pids[name]
         signals = {'kill': signal.SIGKILL, 'end': signal.SIGTERM, 'freeze': signal.SIGSTOP}
         self._supervisor.signal(name, signals[kind])
-        began = self._operator.now  # not before: telling takes its time, and frames go on
+        began = self.operator.now  # not before: telling takes its time, and frames go on
         if kind == 'freeze':
             self._thaw[name] = process, began, began + float(self._random.uniform(*FREEZE_RANGE_S))
         else:
@@ -144,52 +134,33 @@ def run_chaos(options: ChaosOptions) -> Status:
     """
     scene = load_scene(options.scene)
     bag = new_bag(options.bag, f'chaos-{scene.name}')
-    notes, mischief = session_console(), None
 
-    def tell(event: Event) -> None:
-        if event.kind == 'ready' and mischief is not None:
-            mischief.ready(event.node)
-        elif event.kind != 'warning':
-            progress.show(event)
+    def report(mischief: FaultInjector, outcome: Outcome) -> list[str]:
+        faults = sorted([*mischief.faults, *mischief.unfinished()], key=lambda fault: fault.began)
+        seen = mischief.operator.seen
+        failures = [
+            *force_failures(seen, faults, scene.device.load_profile()),
+            *lost_cuts(seen),
+            *not_recovered(faults),
+            *outcome.kills,
+            *_unread(bag, outcome.interrupted, faults),
+            *_idle(seen, faults),
+        ]
+        _report(faults, seen, failures, bag, as_json=options.as_json)
+        return failures
 
-    with (
-        reserved_domain(options.domain) as domain,
-        tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
-        SessionProgress(notes, 5) as progress,
-        Supervisor(
-            _nodes(scene, bag, options.seed, Path(temporary)),
-            bag / 'log',
-            node_environment(domain),
-            tell,
-            restart=True,
-        ) as supervisor,
-    ):
-        if not supervisor.start():
-            return report_failed_start(supervisor.end(), bag, notes)
-        operator = Operator(scene, domain, options.seed)
-        mischief = FaultInjector(supervisor, operator, options)
-        supervisor.run(60 * options.minutes + RECOVERY_TIMEOUT_S, tick=mischief.tick)
-        operator.end()
-        outcome = supervisor.end()
-    faults = sorted([*mischief.faults, *mischief.unfinished()], key=lambda fault: fault.began)
-    seen = operator.seen
-    failures = [
-        *force_failures(seen, faults, scene.device.load_profile()),
-        *lost_cuts(seen),
-        *not_recovered(faults),
-        *outcome.kills,
-        *_unread(bag, outcome.interrupted, faults),
-        *_idle(seen, faults),
-    ]
-    _report(faults, seen, failures, bag, as_json=options.as_json)
-    if outcome.interrupted:
-        return Status.INTERRUPTED
-    return Status.FAILED if failures else Status.OK
-
-
-def _nodes(scene: Scene, bag: Path, seed: int, folder: Path) -> list[NodeCommand]:
-    nodes = simulation_nodes(scene.path, seed, folder / 'tissue.checkpoint')
-    return [*nodes, recorder_command(scene.path, bag, seed)]
+    return run_trial(
+        options,
+        lambda folder: [
+            *simulation_nodes(scene.path, options.seed, folder / 'tissue.checkpoint'),
+            recorder_command(scene.path, bag, options.seed),
+        ],
+        lambda running: FaultInjector(running, scene, options),
+        report,
+        seconds=60 * options.minutes + RECOVERY_TIMEOUT_S,
+        bag=bag,
+        restart=True,
+    )
 
 
 def _idle(seen: Observations, faults: list[Fault]) -> list[str]:
@@ -243,7 +214,6 @@ def _recorder_away(fault: Fault, faults: list[Fault]) -> bool:
 def _report(
     faults: list[Fault], seen: Observations, failures: list[str], bag: Path, *, as_json: bool
 ) -> None:
-    console = Console()
     down = [f.ended - f.began for f in faults if f.kind != 'freeze']
     values: Mapping[str, Any] = {
         'faults': len(faults),
@@ -251,18 +221,9 @@ def _report(
         'longest absence of a node [s]': round(max(down, default=0.0), 2),
         'changes by cuts': seen.topologies[-1][1] if seen.topologies else 0,
         'bags': [str(path) for path in bags_of(bag)],
-        'failures': failures,
     }
-    if as_json:
-        console.out(json.dumps({**values, 'all': [asdict(f) for f in faults]}), highlight=False)
-        return
     table = Table('fault', 'node', 'at [s]', 'back after [s]', box=None)
     for f in faults:
         table.add_row(f.kind, f.node, f'{f.began:.1f}', f'{f.ended - f.began:.2f}')
-    console.print(table)
-    for name, value in values.items():
-        if name not in ('failures', 'bags'):
-            console.print(f'{name}: {value}', highlight=False, markup=False)
-    console.print(f'bags: {", ".join(path.name for path in bags_of(bag))} in {bag.parent}')
-    for failure in failures:
-        console.print(f'[bold red]not as it should be:[/] {failure}', highlight=False)
+    more = {'all': [asdict(f) for f in faults]}
+    print_result(values, table, failures, more=more, as_json=as_json)

@@ -1,40 +1,27 @@
 """`bench fuzz`: send invalid messages to a session, and check that it goes on."""
 
-import json
-import tempfile
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 import rclpy
 from rclpy.node import Node
-from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from bench.trials.chaos_verdict import force_failures
 from bench.trials.fuzz_graph import EXCLUDED_SERVICES, Fuzzer, SentMessages
 from bench.trials.fuzz_verdict import busiest_second, problems
 from bench.trials.fuzz_watch import NodeObserver
 from bench.trials.operator import Operator
+from bench.trials.trial import Running, TrialOptions, print_result, run_trial
 from cutting_trainer.session.changed_scene import write_changed
-from cutting_trainer.session.demo import new_bag, report_failed_start
-from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import (
-    LOCAL,
-    node_environment,
-    recorder_command,
-    simulation_nodes,
-    viewer_command,
-)
+from cutting_trainer.session.demo import new_bag
+from cutting_trainer.session.graph import LOCAL, recorder_command, simulation_nodes, viewer_command
 from cutting_trainer.session.node_process import NodeCommand
-from cutting_trainer.session.progress import SessionProgress
+from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.scene import Scene, load_scene
 from cutting_trainer.session.status import Status
-from cutting_trainer.session.supervisor import Event, Supervisor
-from cutting_trainer.session.terminal import session_console
 
 NODE, OPERATOR = 'fuzz', 'operator'
 TOUCH_TIMEOUT_S = 60.0
@@ -54,54 +41,45 @@ CHANGES = {'cutting.method': 'combined'}
 
 
 @dataclass(frozen=True)
-class FuzzOptions:
+class FuzzOptions(TrialOptions):
     """Options of `fuzz`.
 
     Attributes:
-        scene: name or path.
         messages: number of messages.
         flood: [s] for which each topic of 1 kHz is flooded afterwards with 10 kHz.
         largest: [MB] of one message to each topic that can have so many.
-        seed: seed of all random numbers.
         bag: folder of the new bag; None: a folder named after scene and time.
-        domain: ROS domain, or `free`.
-        as_json: print the outcome as JSON.
     """
 
-    scene: str
     messages: int
     flood: float
     largest: float
-    seed: int
     bag: Path | None
-    domain: int | Literal['free']
-    as_json: bool
 
 
 class FuzzedSession:
     """Fuzzed session from its first contact to its last.
 
     Args:
-        options: options of the command line.
+        running: the session.
         scene: scene of the nodes.
-        domain: ROS domain of the session.
-        supervisor: supervisor of the nodes.
+        options: options of the command line.
     """
 
-    def __init__(
-        self, options: FuzzOptions, scene: Scene, domain: int, supervisor: Supervisor
-    ) -> None:
+    def __init__(self, running: Running, scene: Scene, options: FuzzOptions) -> None:
         self.began = self.ended = np.inf
         self.afterwards = False
         self._options = options
         self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
+        rclpy.init(context=self._context, domain_id=running.domain)
         self._node = Node(
             NODE, context=self._context, start_parameter_services=False, enable_rosout=False
         )
         self.sent = SentMessages()
-        self.operator = Operator(scene, domain, options.seed, STROKE_DURATION_S, self.sent.has)
-        self.watch = NodeObserver(self._node, lambda: supervisor.pids, self.sent.has)
+        self.operator = Operator(
+            scene, running.domain, options.seed, STROKE_DURATION_S, self.sent.has
+        )
+        self.watch = NodeObserver(self._node, lambda: running.supervisor.pids, self.sent.has)
         self.fuzzer: Fuzzer | None = None
         self._due = self.operator.now + TOUCH_TIMEOUT_S
 
@@ -118,6 +96,9 @@ class FuzzedSession:
             return True
         self.afterwards = self._felt_and_cut(self.ended + SETTLING_TIME_S)
         return not self.afterwards and now < self._due
+
+    def ready(self, node: str) -> None:
+        """Do nothing: no node is restarted."""
 
     def end(self) -> None:
         """Leave the graph."""
@@ -182,41 +163,23 @@ def run_fuzz(options: FuzzOptions) -> Status:
     """
     scene = load_scene(options.scene)
     bag = new_bag(options.bag, f'fuzz-{scene.name}')
-    notes = session_console()
-    with (
-        reserved_domain(options.domain) as domain,
-        tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
-    ):
-        folder = Path(temporary)
-        nodes = _nodes(write_changed(scene, folder, CHANGES), bag, options.seed, folder)
 
-        def tell(event: Event) -> None:
-            if event.kind != 'warning':  # rejections are printed at the end
-                progress.show(event)
+    def report(course: FuzzedSession, outcome: Outcome) -> list[str]:
+        for name, node in course.watch.nodes.items():
+            log = bag / 'log' / f'{name}.log'
+            node.busiest = busiest_second(log.read_text(errors='replace')) if log.exists() else 0
+        failures = [*outcome.troubles, *course.failures(scene)]
+        _report(course, failures, bag, as_json=options.as_json)
+        return failures
 
-        with (
-            SessionProgress(notes, len(nodes)) as progress,
-            Supervisor(nodes, bag / 'log', node_environment(domain), tell) as supervisor,
-        ):
-            if not supervisor.start():
-                return report_failed_start(supervisor.end(), bag, notes)
-            course = FuzzedSession(options, scene, domain, supervisor)
-            supervisor.run(
-                MAX_DURATION_S + MAX_TIME_PER_MESSAGE_S * options.messages, tick=course.tick
-            )
-            course.end()
-            outcome = supervisor.end()
-    for name, node in course.watch.nodes.items():
-        log = bag / 'log' / f'{name}.log'
-        node.busiest = busiest_second(log.read_text(errors='replace')) if log.exists() else 0
-    failures = [
-        *outcome.troubles,
-        *course.failures(scene),
-    ]
-    _report(course, failures, bag, as_json=options.as_json)
-    if outcome.interrupted:
-        return Status.INTERRUPTED
-    return Status.FAILED if failures else Status.OK
+    return run_trial(
+        options,
+        lambda folder: _nodes(write_changed(scene, folder, CHANGES), bag, options.seed, folder),
+        lambda running: FuzzedSession(running, scene, options),
+        report,
+        seconds=MAX_DURATION_S + MAX_TIME_PER_MESSAGE_S * options.messages,
+        bag=bag,
+    )
 
 
 def _nodes(scene: Path, bag: Path, seed: int, folder: Path) -> list[NodeCommand]:
@@ -228,9 +191,9 @@ def _nodes(scene: Path, bag: Path, seed: int, folder: Path) -> list[NodeCommand]
 
 
 def _report(course: FuzzedSession, failures: list[str], bag: Path, *, as_json: bool) -> None:
-    console, fuzzer, seen = Console(), course.fuzzer, course.operator.seen
+    fuzzer, seen = course.fuzzer, course.operator.seen
     nodes = dict(sorted(course.watch.nodes.items()))
-    values: Mapping[str, Any] = {
+    values = {
         'messages': fuzzer.messages.total() if fuzzer else 0,
         'topics': len(fuzzer.targets) if fuzzer else 0,
         'services': len(fuzzer.clients) if fuzzer else 0,
@@ -242,46 +205,22 @@ def _report(course: FuzzedSession, failures: list[str], bag: Path, *, as_json: b
         'commands seen': len(seen.commanded),
         'left out': [f'NODE/{name}' for name in EXCLUDED_SERVICES],
         'bag': str(bag),
-        'failures': failures,
     }
-    if as_json:
-        by_node = {
-            name: {
-                'memory before [MB]': round(node.before),
-                'memory at the end [MB]': round(node.after),
-                'most memory [MB]': round(node.most),
-                'longest silence [s]': round(node.silence, 2),
-                'longest period of its loop [s]': round(node.period, 4),
-                'most lines of the log in a second': node.busiest,
-                'refused': node.refused,
-            }
-            for name, node in nodes.items()
+    by_node = {
+        name: {
+            'memory before [MB]': round(node.before),
+            'memory at the end [MB]': round(node.after),
+            'most memory [MB]': round(node.most),
+            'longest silence [s]': round(node.silence, 2),
+            'longest period of its loop [s]': round(node.period, 4),
+            'most lines of the log in a second': node.busiest,
+            'refused': node.refused,
         }
-        console.out(json.dumps({**values, 'nodes': by_node}), highlight=False)
-        return
-    columns = (
-        'before [MB]',
-        'at the end',
-        'most',
-        'silence [s]',
-        'period [s]',
-        'log [lines/s]',
-        'refused',
-    )
-    table = Table('node', *columns, 'reasons', box=None)
-    for name, node in nodes.items():
+        for name, node in nodes.items()
+    }
+    table = Table(Column('node', no_wrap=True), *next(iter(by_node.values()), {}), box=None)
+    for name, row in by_node.items():
         table.add_row(
-            name,
-            *(f'{x:.0f}' for x in (node.before, node.after, node.most)),
-            f'{node.silence:.1f}',
-            f'{node.period:.3f}',
-            str(node.busiest),
-            str(sum(node.refused.values())),
-            str(len(node.refused)),
+            name, *map(str, (row | {'refused': sum(nodes[name].refused.values())}).values())
         )
-    console.print(table)
-    for name, value in values.items():
-        if name != 'failures':
-            console.print(f'{name}: {value}', highlight=False, markup=False, soft_wrap=True)
-    for failure in failures:
-        console.print(f'[bold red]not as it should be:[/] {failure}', highlight=False)
+    print_result(values, table, failures, more={'nodes': by_node}, as_json=as_json)

@@ -1,40 +1,32 @@
 """`bench soak`: run many sessions on the same processes, and check the growth of resources."""
 
-import json
 import shutil
-import tempfile
 import time
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
-from rich.console import Console
 from rich.table import Table
 
 from bench.trials.chaos import bags_of
 from bench.trials.chaos_verdict import force_failures
 from bench.trials.operator import Operator
-from cutting_trainer.haptic_bridge.settings import DeviceProfile
-from cutting_trainer.session.demo import report_failed_start
-from cutting_trainer.session.domain import reserved_domain
+from bench.trials.trial import Running, TrialOptions, print_result, run_trial
 from cutting_trainer.session.graph import (
     CUTTING_NODE,
     RECORDER_NODE,
     TISSUE_NODE,
-    node_environment,
     recorder_command,
     simulation_nodes,
 )
-from cutting_trainer.session.progress import SessionProgress
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.outcome import Outcome
+from cutting_trainer.session.scene import Scene, load_scene
 from cutting_trainer.session.status import Status
-from cutting_trainer.session.supervisor import Supervisor
-from cutting_trainer.session.terminal import session_console
 
 RESTARTED_NODES = (RECORDER_NODE, TISSUE_NODE, CUTTING_NODE)
 """Nodes that restart with each session; the others, and all processes, go on."""
@@ -72,24 +64,16 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class SoakOptions:
+class SoakOptions(TrialOptions):
     """Options of `soak`.
 
     Attributes:
-        scene: name or path.
         minutes: duration [min].
         every: length of a session [s].
-        seed: seed of the places of the hand.
-        domain: ROS domain, or `free`.
-        as_json: print the outcome as JSON.
     """
 
-    scene: str
     minutes: float
     every: float
-    seed: int
-    domain: int | Literal['free']
-    as_json: bool
 
 
 def sample_process(name: str, pid: int, seconds: float) -> Sample | None:
@@ -149,29 +133,67 @@ def quarters(rows: np.ndarray) -> tuple[float, float]:
     return float(np.median(early)), float(np.median(rows[rows[:, 0] >= end - quarter, 1]))
 
 
-class _SessionCycle:
-    """Start the next session on the running processes, transition by transition."""
+class SoakedSession:
+    """Start session after session on the running processes, and sample their resources.
 
-    def __init__(
-        self, operator: Operator, profile: DeviceProfile, folder: Path, every: float
-    ) -> None:
-        self.sessions, self.failures = 1, list[str]()
-        self._operator, self._profile = operator, profile
-        self._folder, self._every = folder, every
+    Args:
+        running: the session.
+        scene: scene of the nodes.
+        options: duration, and length of a session.
+
+    Attributes:
+        sessions: number of sessions.
+        samples: samples of the resources.
+        failures: refused transitions and unsafe forces, as sentences.
+    """
+
+    def __init__(self, running: Running, scene: Scene, options: SoakOptions) -> None:
+        self.sessions, self.failures, self.samples = 1, list[str](), list[Sample]()
+        self._running, self._options = running, options
+        self._operator = Operator(scene, running.domain, options.seed)
+        self._profile = scene.device.load_profile()
         self._clients = {
-            name: operator.node.create_client(ChangeState, f'{name}/change_state')
+            name: self._operator.node.create_client(ChangeState, f'{name}/change_state')
             for name in RESTARTED_NODES
         }
-        self._due = every
+        self._began, self._sample_due = time.monotonic(), 0.0
+        self._due = options.every
         self._left: list[tuple[str, int]] = []
         self._answer: Any = None
         self._since = 0.0
 
+    @property
+    def minutes(self) -> float:
+        """Return the time since the start [min]."""
+        return (time.monotonic() - self._began) / 60
+
     def tick(self, elapsed: float) -> None:
-        """Start the next transition when the present one is done."""
+        """Start the next transition when the present one is done; sample when it is time."""
+        self._running.progress.tick(elapsed, 60 * self._options.minutes)
+        self._renew(elapsed)
+        if elapsed >= self._sample_due:
+            self._sample_due += SAMPLE_PERIOD_S
+            self._sample(elapsed)
+
+    def ready(self, node: str) -> None:
+        """Do nothing: no process is restarted."""
+
+    def end(self) -> None:
+        """Leave the graph."""
+        self._operator.end()
+        self._judge()
+
+    def _sample(self, elapsed: float) -> None:
+        for name, pid in self._running.supervisor.pids.items():
+            if (sample := sample_process(name, pid, elapsed)) is not None:
+                self.samples.append(sample)
+        graph = {'DDS entities': float(entities(self._operator.node))}
+        self.samples.append(Sample(elapsed, 'graph', graph))
+
+    def _renew(self, elapsed: float) -> None:
         if elapsed >= self._due and not self._left:
-            self._due, self._since = self._due + self._every, elapsed
-            self.judge()
+            self._due, self._since = self._due + self._options.every, elapsed
+            self._judge()
             self._left = [(name, step) for step in STEPS for name in RESTARTED_NODES]
         if not self._left:
             return
@@ -187,13 +209,13 @@ class _SessionCycle:
                 self.failures.append(f'{name} refused transition {step} at {elapsed:.0f} s')
             if not self._left:
                 self.sessions += 1
-                remove_old(bags_of(self._folder / 'bag'))
+                remove_old(bags_of(self._running.folder / 'bag'))
             return
         if elapsed > self._since + TRANSITION_TIMEOUT_S:
             self._left, self._answer = [], None
             self.failures.append(f'{name} did not answer to transition {step} at {elapsed:.0f} s')
 
-    def judge(self) -> None:
+    def _judge(self) -> None:
         """Check all forces since the last call."""
         self.failures += force_failures(self._operator.take_seen(), [], self._profile)
 
@@ -204,77 +226,36 @@ def run_soak(options: SoakOptions) -> Status:
     Raises:
         SessionError, SceneError, SettingsError: it cannot be run like this.
     """
-    scene, notes = load_scene(options.scene), session_console()
-    samples: list[Sample] = []
-    with (
-        reserved_domain(options.domain) as domain,
-        tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
-        SessionProgress(notes, 5) as progress,
-        Supervisor(
-            [
-                *simulation_nodes(scene.path, options.seed, Path(temporary) / 'checkpoint'),
-                recorder_command(scene.path, Path(temporary) / 'bag', options.seed),
-            ],
-            Path(temporary) / 'log',
-            node_environment(domain),
-            progress.show,
-        ) as supervisor,
-    ):
-        if not supervisor.start():
-            return report_failed_start(supervisor.end(), Path(temporary), notes)
-        operator = Operator(scene, domain, options.seed)
-        profile = scene.device.load_profile()
-        renewal, due = _SessionCycle(operator, profile, Path(temporary), options.every), 0.0
+    scene = load_scene(options.scene)
 
-        def tick(elapsed: float) -> None:
-            nonlocal due
-            progress.tick(elapsed, 60 * options.minutes)
-            renewal.tick(elapsed)
-            if elapsed < due:
-                return
-            due += SAMPLE_PERIOD_S
-            for name, pid in supervisor.pids.items():
-                if (sample := sample_process(name, pid, elapsed)) is not None:
-                    samples.append(sample)
-            graph = {'DDS entities': float(entities(operator.node))}
-            samples.append(Sample(elapsed, 'graph', graph))
+    def report(course: SoakedSession, outcome: Outcome) -> list[str]:
+        failures = [*outcome.troubles, *growth_failures(course.samples), *course.failures]
+        _report(course, failures, as_json=options.as_json)
+        return failures
 
-        began = time.monotonic()
-        supervisor.run(60 * options.minutes, tick=tick)
-        minutes = (time.monotonic() - began) / 60
-        operator.end()
-        renewal.judge()
-        outcome = supervisor.end()
-    failures = [
-        *outcome.troubles,
-        *growth_failures(samples),
-        *renewal.failures,
-    ]
-    _report(samples, renewal.sessions, minutes, failures, as_json=options.as_json)
-    if outcome.interrupted:
-        return Status.INTERRUPTED
-    return Status.FAILED if failures else Status.OK
+    return run_trial(
+        options,
+        lambda folder: [
+            *simulation_nodes(scene.path, options.seed, folder / 'checkpoint'),
+            recorder_command(scene.path, folder / 'bag', options.seed),
+        ],
+        lambda running: SoakedSession(running, scene, options),
+        report,
+        seconds=60 * options.minutes,
+    )
 
 
-def _report(
-    samples: list[Sample], sessions: int, minutes: float, failures: list[str], *, as_json: bool
-) -> None:
-    console = Console()
+def _report(course: SoakedSession, failures: list[str], *, as_json: bool) -> None:
+    names = ('what', 'name', 'first', 'last')
     rows = []
-    for subject in sorted({sample.subject for sample in samples}):
-        own = [s for s in samples if s.subject == subject]
+    for subject in sorted({sample.subject for sample in course.samples}):
+        own = [s for s in course.samples if s.subject == subject]
         for name in own[0].values:
             first, last = quarters(np.array([(s.seconds, s.values[name]) for s in own]))
             rows.append((subject, name, first, last))
-    if as_json:
-        values = [dict(zip(('what', 'name', 'first', 'last'), row, strict=True)) for row in rows]
-        plain = {'minutes': minutes, 'sessions': sessions, 'quarters': values}
-        console.out(json.dumps({**plain, 'failures': failures}, indent=2), highlight=False)
-        return
     table = Table('process', 'resource', 'first quarter', 'last quarter', box=None)
     for subject, name, first, last in rows:
         table.add_row(subject, name.replace('[', r'\['), f'{first:.4g}', f'{last:.4g}')
-    console.print(table)
-    console.print(f'{sessions} sessions in {minutes:.1f} min', highlight=False)
-    for failure in failures:
-        console.print(f'[bold red]not as it should be:[/] {failure}', highlight=False)
+    values = {'minutes': round(course.minutes, 1), 'sessions': course.sessions}
+    more = {'quarters': [dict(zip(names, row, strict=True)) for row in rows]}
+    print_result(values, table, failures, more=more, as_json=as_json)
