@@ -11,17 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.message_class import message_class
 from cutting_trainer.bags.message_text import schema_text
 from cutting_trainer.bags.metadata import FORMAT_VERSION
 from cutting_trainer.bags.parameters import ParameterCollector
-from cutting_trainer.bags.qos import OfferedQos
+from cutting_trainer.bags.ros_qos import CONFIGURED, is_compatible, offered_qos, strongest_request
 from cutting_trainer.bags.sequences import SequenceCounter
 from cutting_trainer.bags.steady_clock import SteadyClock
-from cutting_trainer.bags.topics import FORCES
 from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.node_common.code_identity import identity_here
 from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
@@ -29,20 +27,11 @@ from cutting_trainer.node_common.output import announce
 from cutting_trainer.node_common.parameters import parameter, scene_parameter, seed_parameter
 from cutting_trainer.node_common.rejections import MessageError
 from cutting_trainer.node_common.ros import (
-    ARM,
     CONTACT,
     CUTTING_STATE,
-    DIAGNOSTICS,
-    EVENTS,
-    FORCE,
     FRAME_INPUTS,
-    LATCHED,
     MARKERS,
-    MESH,
-    MESH_UPDATES,
-    STREAM,
     TISSUE_STATE,
-    UPDATES,
     Diagnostics,
     polled,
 )
@@ -59,23 +48,6 @@ _STATE_TIMEOUT_S = 3.0
 """Time for which a recorder that is to end waits for the states that it has asked for."""
 _DISCOVERY_TIMEOUT_S = 1.0
 """Time after which a topic that was not discovered has no publisher."""
-_QUEUE_DEPTH = 1000
-"""Messages in the queue of a topic: a second of a 1 kHz stream."""
-
-_CONFIGURED = {
-    MESH: LATCHED,
-    MESH_UPDATES: UPDATES,
-    FORCE: STREAM,
-    FRAME_INPUTS: STREAM,
-    CONTACT: STREAM,
-    DIAGNOSTICS: EVENTS,
-    f'{ARM}/measured_cp': STREAM,
-    f'{ARM}/measured_cv': STREAM,
-    f'{ARM}/measured_cf': STREAM,
-    **{name[1:]: STREAM for name in FORCES},
-    f'{ARM}/operating_state': LATCHED,
-}
-"""Depths of our publishers: the graph shows every other part of a QoS, but not its history."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +126,7 @@ class Recorder(ManagedNode):
         self._begun = time.monotonic()
         self._collector = ParameterCollector(self)
         self._depths = {
-            self.resolve_topic_name(name): profile.depth for name, profile in _CONFIGURED.items()
+            self.resolve_topic_name(name): profile.depth for name, profile in CONFIGURED.items()
         }
         self._diagnostics = Diagnostics(self, self._collect)
 
@@ -257,7 +229,9 @@ class Recorder(ManagedNode):
         self.writer.describe(parameters=self._collector.text)
         for stream in self._streams.values():
             publishers = self.get_publishers_info_by_topic(stream.topic)
-            weaker = [p.node_name for p in publishers if not _compatible(p.qos_profile, stream.qos)]
+            weaker = [
+                p.node_name for p in publishers if not is_compatible(p.qos_profile, stream.qos)
+            ]
             if weaker and stream.topic not in self._unrecorded:
                 self._give_up(
                     stream.topic,
@@ -350,11 +324,11 @@ class Recorder(ManagedNode):
             self._give_up(topic, str(error))
             return
         depth = self._depths.get(topic, 10)
-        profiles = dict.fromkeys(_offered(info.qos_profile, depth) for info in publishers)
+        profiles = dict.fromkeys(offered_qos(info.qos_profile, depth) for info in publishers)
         # rosbags looks up hashes of messages only, and rejects a bag that has any other.
         type_hash = str(publishers[0].topic_type_hash) if '/msg/' in type_name else ''
         self.writer.add_topic(topic, type_name, schema, type_hash, tuple(profiles))
-        subscription = polled(self, message_type, topic, _request(publishers))
+        subscription = polled(self, message_type, topic, strongest_request(publishers))
         self._streams[topic] = _Stream(
             topic, subscription, lambda: len(self.get_publishers_info_by_topic(topic))
         )
@@ -401,39 +375,6 @@ def _custom_data(scene: str, seed: int) -> dict[str, str]:
             raise BagError(f'cannot read the scene {scene}: {error.strerror}') from None
         data['scene_file'] = Path(scene).name
     return data
-
-
-def _offered(profile: QoSProfile, depth: int) -> OfferedQos:
-    return OfferedQos(
-        depth=depth,
-        reliability=profile.reliability.name.lower(),
-        durability=profile.durability.name.lower(),
-        deadline=profile.deadline.nanoseconds,
-        lifespan=profile.lifespan.nanoseconds,
-        liveliness=profile.liveliness.name.lower(),
-        liveliness_lease_duration=profile.liveliness_lease_duration.nanoseconds,
-    )
-
-
-def _request(publishers: list[Any]) -> QoSProfile:
-    """Return the strongest QoS that all of the publishers offer."""
-    profiles = [info.qos_profile for info in publishers]
-    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=_QUEUE_DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def _compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
-    reliable = offered.reliability == ReliabilityPolicy.RELIABLE
-    latched = offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    return (reliable or requested.reliability == ReliabilityPolicy.BEST_EFFORT) and (
-        latched or requested.durability == DurabilityPolicy.VOLATILE
-    )
 
 
 if __name__ == '__main__':

@@ -10,13 +10,12 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
 
 from cutting_trainer.bags.message_class import message_class
 from cutting_trainer.bags.player import Playhead, RecordedHand, RecordedStream
-from cutting_trainer.bags.qos import OfferedQos
 from cutting_trainer.bags.reader import Bag
+from cutting_trainer.bags.ros_qos import publisher_qos
 from cutting_trainer.bags.topics import BUTTON, FORCES, OF_DEVICE, OF_TISSUE, POSE, REPLAYED
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
 from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
@@ -24,28 +23,11 @@ from cutting_trainer.node_common.ros import EVENTS, LATCHED, NEWEST_BEST_EFFORT,
 from cutting_trainer.node_common.timing import PeriodicLoop
 
 _RATE_HZ = 1000.0
-_MAX_DEPTH = 1000
-"""Messages in a send queue, whatever depth a bag states."""
 _DISCOVERY_S = 1.5
 """[s] in which existing publishers are discovered."""
 _WATCH_PERIOD_S = 0.5
 _ENABLE_TIMEOUTS_S = {False: 30.0, True: 5.0}
 """[s] in which the haptic bridge must be enabled; after a FAULT, in which it must recover."""
-
-
-def publisher_qos(profiles: list[OfferedQos]) -> QoSProfile:
-    """Return the QoS to play a topic with.
-
-    It is compatible with every subscriber of the recorded publishers.
-    """
-    reliable = all(profile.reliability == 'reliable' for profile in profiles)
-    latched = all(profile.durability == 'transient_local' for profile in profiles) and profiles
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=min(max((profile.depth for profile in profiles), default=10), _MAX_DEPTH),
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
 
 
 class Player(Node):

@@ -19,6 +19,17 @@ from cutting_trainer.cli.options import (
 from cutting_trainer.session.domain import parse_domain
 from cutting_trainer.session.status import Status
 
+Output = Annotated[
+    Path, typer.Option('--output', '-o', help='Folder for page, tables and pictures.')
+]
+Sizes = Annotated[
+    list[int] | None,
+    typer.Option(min=6, max=1_000_000, help='Tetrahedra, about; may be given again.'),
+]
+NewBag = Annotated[
+    Path | None,
+    typer.Option(help='New folder for the bag (default: bags/sessions/COMMAND-SCENE-TIME).'),
+]
 app = typer.Typer(
     name='bench',
     help='Measure what the trainer costs and what it is worth; try to break it.',
@@ -42,10 +53,7 @@ def speed(
         list[Part] | None,
         typer.Argument(help='Which benchmarks; all unless some are named.'),
     ] = None,
-    size: Annotated[
-        list[int] | None,
-        typer.Option(min=6, max=1_000_000, help='Tetrahedra, about; may be given again.'),
-    ] = None,
+    size: Sizes = None,
     as_json: AsJson = False,
     save: Annotated[
         bool, typer.Option('--save', help='Keep the figures in bench/results.')
@@ -62,13 +70,8 @@ def speed(
 
 @app.command(epilog=EXIT_STATUSES)
 def scaling(
-    output: Annotated[
-        Path, typer.Option('--output', '-o', help='Folder; charts/ in it takes the picture.')
-    ] = Path('docs'),
-    size: Annotated[
-        list[int] | None,
-        typer.Option(min=6, max=1_000_000, help='Tetrahedra, about; given twice at least.'),
-    ] = None,
+    output: Output = Path('docs'),
+    size: Sizes = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure how costs grow with the mesh, from 1,000 to 500,000 tetrahedra: a picture."""
@@ -88,9 +91,7 @@ def strokes(
     growth: Annotated[
         float, typer.Option(min=1, max=1000, help='tissue.integration.frequency_growth.')
     ] = 1.1,
-    output: Annotated[
-        Path, typer.Option('--output', '-o', help='Folder; charts/ in it takes the picture.')
-    ] = Path('docs'),
+    output: Output = Path('docs'),
     as_json: AsJson = False,
 ) -> None:
     """Measure time and memory of a session of very many strokes, its mesh checked on the way."""
@@ -115,10 +116,7 @@ def timing(
 
 @app.command(epilog=EXIT_STATUSES)
 def chart(
-    output: Annotated[
-        Path,
-        typer.Option('--output', '-o', help='Folder for the page; charts/ in it for the rest.'),
-    ] = Path('docs'),
+    output: Output = Path('docs'),
     as_json: AsJson = False,
 ) -> None:
     """Measure every method on this machine: error against CPU time, pictures and CSV."""
@@ -160,10 +158,7 @@ def stability(
 
 @app.command(epilog=EXIT_STATUSES)
 def cuts(
-    output: Annotated[
-        Path,
-        typer.Option('--output', '-o', help='Folder for the page, the table and the pictures.'),
-    ] = Path('docs'),
+    output: Output = Path('docs'),
     as_json: AsJson = False,
 ) -> None:
     """Cut the same strokes by every method and compare what they leave."""
@@ -176,10 +171,7 @@ def cuts(
 
 @app.command('haptics-accuracy', epilog=EXIT_STATUSES)
 def haptics_accuracy(
-    output: Annotated[
-        Path,
-        typer.Option('--output', '-o', help='Folder with haptics.md, for tables and picture.'),
-    ] = Path('docs'),
+    output: Output = Path('docs'),
     as_json: AsJson = False,
 ) -> None:
     """Measure the force between frames against a tissue that runs at 1 kHz."""
@@ -190,9 +182,7 @@ def haptics_accuracy(
 
 @app.command('haptics-stability', epilog=EXIT_STATUSES)
 def haptics_stability(
-    output: Annotated[
-        Path, typer.Option('--output', '-o', help='Folder with haptics.md, for table and picture.')
-    ] = Path('docs'),
+    output: Output = Path('docs'),
     as_json: AsJson = False,
 ) -> None:
     """Map where the tool can be held still, by hand, tissue, delay and loss."""
@@ -223,10 +213,7 @@ def chaos(
     scene: SceneOption = 'block',
     minutes: Annotated[float, typer.Option(min=1.0, max=1440.0, help='Duration [min].')] = 10.0,
     faults: Annotated[int, typer.Option(min=1, help='How many nodes are struck.')] = 50,
-    bag: Annotated[
-        Path | None,
-        typer.Option(help='New folder for the bag (default: bags/sessions/chaos-SCENE-TIME).'),
-    ] = None,
+    bag: NewBag = None,
     seed: Seed = 0,
     domain: Domain = 'free',
     as_json: AsJson = False,
@@ -252,10 +239,7 @@ def fuzz(
         float,
         typer.Option(min=5.0, max=1000.0, help='Size of one huge message to each topic [MB].'),
     ] = 100.0,
-    bag: Annotated[
-        Path | None,
-        typer.Option(help='New folder for the bag (default: bags/sessions/fuzz-SCENE-TIME).'),
-    ] = None,
+    bag: NewBag = None,
     seed: Seed = 0,
     domain: Domain = 'free',
     as_json: AsJson = False,

@@ -6,7 +6,6 @@ import select
 import sys
 import termios
 import tty
-from types import TracebackType
 from typing import Any, Self
 
 _LOCAL_FLAGS = 3
@@ -30,12 +29,7 @@ class Keys:
         self._take()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._before and not _of_another(self._file):
             with contextlib.suppress(termios.error):  # the terminal was closed
                 termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,28 @@ def write_scene(
     with path.open('w') as file:
         YAML().dump(scene, file)
     return path
+
+
+@contextmanager
+def running(
+    command: Sequence[str], environment: Mapping[str, str], ready: str = ''
+) -> Iterator['subprocess.Popen[str]']:
+    """Runs a program, of which one of the first lines is `ready`; kills it at the end."""
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        assert not ready or f'{ready}\n' in process.stdout
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def node_words(module: str, *arguments: str) -> list[str]:
+    """The command of a node, without its interpreter's environment."""
+    return [sys.executable, '-m', module, '--ros-args', *arguments]
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> Any:

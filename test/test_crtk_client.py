@@ -4,13 +4,12 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
+from live import node_words, running
 
 pytest.importorskip('rclpy')
 
@@ -42,27 +41,10 @@ def types(request: pytest.FixtureRequest) -> tuple[str, dict[str, str]]:
     return 'crtk_msgs', request.getfixturevalue('others_messages')
 
 
-@contextmanager
-def running(
-    name: str, scene: Path, environment: dict[str, str], remappings: dict[str, str]
-) -> Iterator[Any]:
-    arguments = ['-p', f'scene:={scene}']
-    for ours, theirs in remappings.items():
-        arguments += ['-r', f'{ours}:={theirs}']
-    node = subprocess.Popen(
-        [sys.executable, '-m', MODULES[name], '--ros-args', *arguments],
-        cwd=ROOT,
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert node.stdout is not None
-        assert f'ready: {name}\n' in node.stdout
-        yield node
-    finally:
-        node.kill()
-        node.communicate()
+def started(name: str, scene: Path, environment: dict[str, str], remappings: dict[str, str]) -> Any:
+    remaps = [word for rule in remappings.items() for word in ('-r', ':='.join(rule))]
+    command = node_words(MODULES[name], '-p', f'scene:={scene}', *remaps)
+    return running(command, environment, f'ready: {name}')
 
 
 def play(types: tuple[str, dict[str, str]], *arguments: str) -> dict[str, Any]:
@@ -105,7 +87,7 @@ def test_a_crtk_client_that_joins_late_enables_reads_moves_and_operates_the_arm(
     names = (*names, 'operating_state', 'state_command')
     remapped = {f'arm/{name}': f'/MTML/{name}' for name in names}
     remapped['arm/body/servo_cf'] = '/MTML/servo_cf'  # the client has no `body`
-    with running('emulated_arm', scene, in_domain(types[1]), remapped):
+    with started('emulated_arm', scene, in_domain(types[1]), remapped):
         seen = play(types, 'arm', '/MTML')
     at_once(seen['joined'], 'ENABLED')
     assert seen['query'] == ['ENABLED', True, False]
@@ -128,7 +110,7 @@ def test_a_crtk_device_drives_the_bridge_and_a_client_operates_it(types, scene):
         'haptic_bridge/operating_state': '/bridge/operating_state',
         'haptic_bridge/state_command': '/bridge/state_command',
     }
-    with running('haptic_bridge', scene, in_domain(types[1]), remapped):
+    with started('haptic_bridge', scene, in_domain(types[1]), remapped):
         seen = play(types, 'device', '/phantom', '/bridge')
     assert seen['query'] == ['DISABLED', True, False]
     at_once(seen['joined'], 'ENABLED')

@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,7 +14,7 @@ import pytest
 import rclpy
 from cutting_trainer_msgs.msg import Contact, ForceSample, FrameInputs
 from cutting_trainer_msgs.srv import Cut, GetMesh
-from live import free_domain, wait_for
+from live import free_domain, node_words, running, wait_for
 from rclpy.executors import SingleThreadedExecutor
 
 from cutting_trainer.bags.frames import read_frames
@@ -84,16 +82,8 @@ class Between:
 
 
 def start(stack: ExitStack, module: str, scene: Path, domain: int, *more: str) -> Any:
-    process = subprocess.Popen(
-        [sys.executable, '-m', module, '--ros-args', '-p', f'scene:={scene}', *more],
-        cwd=ROOT,
-        env=node_environment(domain),
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    stack.callback(process.wait)
-    stack.callback(process.kill)
-    return process
+    command = node_words(module, '-p', f'scene:={scene}', *more)
+    return stack.enter_context(running(command, node_environment(domain)))
 
 
 @pytest.fixture

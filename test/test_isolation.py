@@ -9,7 +9,7 @@ from pathlib import Path
 from shutil import which
 
 import pytest
-from live import ROOT, free_domain, two_presses, write_scene
+from live import ROOT, free_domain, node_words, running, two_presses, write_scene
 
 from bench.graph.impaired_link import TwoHosts, missing_rights
 from cutting_trainer.session.graph import MODULES, node_environment
@@ -64,19 +64,8 @@ def found(
 ) -> dict[str, object]:
     """What a stranger on a host gets of an arm on host 0."""
     scene = write_scene(tmp_path, two_presses(), 7.0, 100.0)
-    arm = subprocess.Popen(
-        hosts.on(
-            0,
-            [sys.executable, '-m', MODULES['emulated_arm'], '--ros-args', '-p', f'scene:={scene}'],
-        ),
-        cwd=ROOT,
-        env=arms,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert arm.stdout is not None
-        assert arm.stdout.readline() == 'ready: emulated_arm\n'
+    arm = hosts.on(0, node_words(MODULES['emulated_arm'], '-p', f'scene:={scene}'))
+    with running(arm, arms, 'ready: emulated_arm'):
         listener = [sys.executable, '-c', STRANGER, str(SECONDS)]
         done = subprocess.run(
             hosts.on(host, [*listener, then]), cwd=ROOT, env=strangers, stdout=-1, check=True
@@ -87,9 +76,6 @@ def found(
             )
             return {'heard': json.loads(done.stdout)['heard'], 'own': json.loads(own.stdout)}
         return dict(json.loads(done.stdout))
-    finally:
-        arm.kill()
-        arm.communicate()
 
 
 def on_the_network(domain: int, hosts: TwoHosts, other: int) -> dict[str, str]:

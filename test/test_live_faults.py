@@ -35,7 +35,9 @@ from live import (
     deaths,
     free_domain,
     held_up,
+    node_words,
     require_limits,
+    running,
     two_presses,
     wait_for,
     worst_gap,
@@ -91,18 +93,9 @@ def session(tmp_path: Path, domain: int) -> Iterator[LiveSession]:
 def witness(tmp_path: Path, domain: int) -> Iterator['subprocess.Popen[str]']:
     """Another recorder in the domain of the session, ready to hear."""
     arguments = ['-r', '__node:=witness', '-p', f'bag:={tmp_path / "seen"}']
-    witness = subprocess.Popen(
-        [sys.executable, '-m', 'cutting_trainer.bags.node', '--ros-args', *arguments],
-        cwd=ROOT,
-        env=node_environment(domain),
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert witness.stdout is not None
-    assert witness.stdout.readline() == 'ready: witness\n'
-    yield witness
-    witness.kill()
-    witness.wait()
+    command = node_words('cutting_trainer.bags.node', *arguments)
+    with running(command, node_environment(domain), 'ready: witness') as witness:
+        yield witness
 
 
 @pytest.fixture

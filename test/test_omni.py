@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from live import node_words, running
 
 from cutting_trainer.haptic_bridge.devices.omni import ForceLatch, OmniConvention
 from cutting_trainer.session.graph import node_environment
@@ -52,22 +53,9 @@ def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
     names = ('state', 'button', 'force_feedback')
     remapped = [word for name in names for word in ('-r', f'omni/{name}:=phantom/{name}')]
     parameters = ['-p', 'unit:=mm', '-p', 'force_axes:=x z y']
-    adapter = subprocess.Popen(
-        [
-            sys.executable,
-            '-m',
-            'cutting_trainer.haptic_bridge.devices.omni_node',
-            '--ros-args',
-            *parameters,
-            *remapped,
-        ],
-        cwd=ROOT,
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert adapter.stdout.readline() == 'ready: omni_adapter\n'
+    module = 'cutting_trainer.haptic_bridge.devices.omni_node'
+    command = node_words(module, *parameters, *remapped)
+    with running(command, environment, 'ready: omni_adapter'):
         done = subprocess.run(
             [sys.executable, str(ROOT / 'test' / 'omni_driver.py')],
             env=environment,
@@ -76,9 +64,6 @@ def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
             timeout=90,
             check=False,
         )
-    finally:
-        adapter.kill()
-        adapter.communicate()
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout)
     assert seen['pushed'] == pytest.approx(0.8)

@@ -1,13 +1,13 @@
 """Who may publish what moves the hand: judged by the graph's list, whatever they send."""
 
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import rclpy
+from live import running
 from rclpy.node import Node
 
 from cutting_trainer.node_common.publishers import (
@@ -75,21 +75,8 @@ while True:
 """
 
 
-@contextmanager
-def publishing(domain: int) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, '-c', PUBLISHER],
-        env=node_environment(domain),
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == 'ready\n'
-        yield process
-    finally:
-        process.kill()
-        process.wait()
+def publishing(domain: int) -> Any:
+    return running([sys.executable, '-c', PUBLISHER], node_environment(domain), 'ready')
 
 
 @pytest.mark.real_time

@@ -31,8 +31,9 @@ from cutting_trainer.bags.player import (
     RecordedStream,
     duration,
 )
-from cutting_trainer.bags.player_node import HandPlayer, SessionPlayer, publisher_qos
+from cutting_trainer.bags.player_node import HandPlayer, SessionPlayer
 from cutting_trainer.bags.reader import Bag, Recorded, open_bag
+from cutting_trainer.bags.ros_qos import publisher_qos
 from cutting_trainer.bags.topics import (
     BUTTON,
     CONTACT,

@@ -1,17 +1,15 @@
 """The transport between the nodes: on this machine only, and no process can hold up another's."""
 
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from live import ROOT, free_domain
+from live import ROOT, free_domain, running
 
 from cutting_trainer.session.graph import PROFILES, RANGE, discovery, node_environment
 from cutting_trainer.session.network import Network, network_environment
@@ -49,19 +47,9 @@ while True:
 """
 
 
-@contextmanager
-def process(role: str, environment: dict[str, str]) -> Iterator['subprocess.Popen[str]']:
+def process(role: str, environment: dict[str, str]) -> Any:
     """A process that publishes or listens, ready; killed at the end."""
-    talk = subprocess.Popen(
-        [sys.executable, '-c', TALK, role], stdout=subprocess.PIPE, env=environment, text=True
-    )
-    try:
-        assert talk.stdout is not None
-        assert talk.stdout.readline() == 'ready\n'
-        yield talk
-    finally:
-        talk.kill()
-        talk.communicate()
+    return running([sys.executable, '-c', TALK, role], environment, 'ready')
 
 
 def sockets(pid: int) -> set[str]:

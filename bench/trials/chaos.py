@@ -18,11 +18,18 @@ from bench.trials.chaos_verdict import (
     not_recovered,
 )
 from bench.trials.operator import FAULTS, Operator
-from bench.trials.trial import Running, TrialOptions, print_result, run_trial
+from bench.trials.trial import (
+    Course,
+    Running,
+    TrialOptions,
+    print_result,
+    recorded_nodes,
+    run_trial,
+)
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.session.demo import new_bag
-from cutting_trainer.session.graph import RECORDER_NODE, recorder_command, simulation_nodes
+from cutting_trainer.session.graph import RECORDER_NODE
 from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.scene import Scene, load_scene
 from cutting_trainer.session.status import Status
@@ -52,7 +59,7 @@ class ChaosOptions(TrialOptions):
     bag: Path | None
 
 
-class FaultInjector:
+class FaultInjector(Course):
     """Inject faults into the nodes of a session at random times.
 
     Args:
@@ -151,10 +158,7 @@ def run_chaos(options: ChaosOptions) -> Status:
 
     return run_trial(
         options,
-        lambda folder: [
-            *simulation_nodes(scene.path, options.seed, folder / 'tissue.checkpoint'),
-            recorder_command(scene.path, bag, options.seed),
-        ],
+        lambda folder: recorded_nodes(scene, options, folder, bag),
         lambda running: FaultInjector(running, scene, options),
         report,
         seconds=60 * options.minutes + RECOVERY_TIMEOUT_S,

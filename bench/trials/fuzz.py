@@ -14,7 +14,7 @@ from bench.trials.fuzz_graph import EXCLUDED_SERVICES, Fuzzer, SentMessages
 from bench.trials.fuzz_verdict import busiest_second, problems
 from bench.trials.fuzz_watch import NodeObserver
 from bench.trials.operator import Operator
-from bench.trials.trial import Running, TrialOptions, print_result, run_trial
+from bench.trials.trial import Course, Running, TrialOptions, print_result, run_trial
 from cutting_trainer.session.changed_scene import write_changed
 from cutting_trainer.session.demo import new_bag
 from cutting_trainer.session.graph import LOCAL, recorder_command, simulation_nodes, viewer_command
@@ -57,7 +57,7 @@ class FuzzOptions(TrialOptions):
     bag: Path | None
 
 
-class FuzzedSession:
+class FuzzedSession(Course):
     """Fuzzed session from its first contact to its last.
 
     Args:
@@ -96,9 +96,6 @@ class FuzzedSession:
             return True
         self.afterwards = self._felt_and_cut(self.ended + SETTLING_TIME_S)
         return not self.afterwards and now < self._due
-
-    def ready(self, node: str) -> None:
-        """Do nothing: no node is restarted."""
 
     def end(self) -> None:
         """Leave the graph."""

@@ -16,14 +16,15 @@ from rich.table import Table
 from bench.trials.chaos import bags_of
 from bench.trials.chaos_verdict import force_failures
 from bench.trials.operator import Operator
-from bench.trials.trial import Running, TrialOptions, print_result, run_trial
-from cutting_trainer.session.graph import (
-    CUTTING_NODE,
-    RECORDER_NODE,
-    TISSUE_NODE,
-    recorder_command,
-    simulation_nodes,
+from bench.trials.trial import (
+    Course,
+    Running,
+    TrialOptions,
+    print_result,
+    recorded_nodes,
+    run_trial,
 )
+from cutting_trainer.session.graph import CUTTING_NODE, RECORDER_NODE, TISSUE_NODE
 from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.scene import Scene, load_scene
 from cutting_trainer.session.status import Status
@@ -133,7 +134,7 @@ def quarters(rows: np.ndarray) -> tuple[float, float]:
     return float(np.median(early)), float(np.median(rows[rows[:, 0] >= end - quarter, 1]))
 
 
-class SoakedSession:
+class SoakedSession(Course):
     """Start session after session on the running processes, and sample their resources.
 
     Args:
@@ -174,9 +175,6 @@ class SoakedSession:
         if elapsed >= self._sample_due:
             self._sample_due += SAMPLE_PERIOD_S
             self._sample(elapsed)
-
-    def ready(self, node: str) -> None:
-        """Do nothing: no process is restarted."""
 
     def end(self) -> None:
         """Leave the graph."""
@@ -235,10 +233,7 @@ def run_soak(options: SoakOptions) -> Status:
 
     return run_trial(
         options,
-        lambda folder: [
-            *simulation_nodes(scene.path, options.seed, folder / 'checkpoint'),
-            recorder_command(scene.path, folder / 'bag', options.seed),
-        ],
+        lambda folder: recorded_nodes(scene, options, folder),
         lambda running: SoakedSession(running, scene, options),
         report,
         seconds=60 * options.minutes,

@@ -5,17 +5,18 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, TypeVar
 
 from rich.console import Console
 from rich.table import Table
 
 from cutting_trainer.session.demo import report_failed_start
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.graph import node_environment, recorder_command, simulation_nodes
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.progress import SessionProgress
+from cutting_trainer.session.scene import Scene
 from cutting_trainer.session.status import Status
 from cutting_trainer.session.supervisor import Event, Supervisor
 from cutting_trainer.session.terminal import session_console
@@ -55,20 +56,30 @@ class Running:
     progress: SessionProgress
 
 
-class Course(Protocol):
+class Course:
     """What is done to a running session."""
 
     def tick(self, elapsed: float) -> bool | None:
         """Advance the course at a time [s]; return False at its end."""
+        raise NotImplementedError
 
     def ready(self, node: str) -> None:
-        """Register a node that was restarted and is ready again."""
+        """Register a node that was restarted and is ready again; by default do nothing."""
 
     def end(self) -> None:
         """Leave the graph."""
+        raise NotImplementedError
 
 
 C = TypeVar('C', bound=Course)
+
+
+def recorded_nodes(
+    scene: Scene, options: TrialOptions, folder: Path, bag: Path | None = None
+) -> list[NodeCommand]:
+    """Return the nodes of a session with a recorder; its bag is in the folder if none is named."""
+    nodes = simulation_nodes(scene.path, options.seed, folder / 'checkpoint')
+    return [*nodes, recorder_command(scene.path, bag or folder / 'bag', options.seed)]
 
 
 def run_trial(
@@ -135,15 +146,7 @@ def print_result(
     more: Mapping[str, Any],
     as_json: bool,
 ) -> None:
-    """Print the result of a trial.
-
-    Args:
-        values: result by name.
-        table: table that stands above the values; not part of the JSON.
-        failures: sentences.
-        more: further values of the JSON.
-        as_json: print JSON.
-    """
+    """Print the result of a trial: a table, values and failures; or JSON with `more` values."""
     console = Console()
     if as_json:
         console.out(json.dumps({**values, **more, 'failures': list(failures)}), highlight=False)
