@@ -1,7 +1,7 @@
 """Commands that measure and torture the trainer: `./trainer bench COMMAND`, in a checkout only."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -265,6 +265,25 @@ def soak(
 
     options = SoakOptions(scene, seed, parse_domain(domain), as_json, minutes, every)
     raise typer.Exit(int(run_soak(options)))
+
+
+@app.command(epilog=EXIT_STATUSES)
+def faults(
+    count: Annotated[int, typer.Option(min=1, help='How many faults.')] = 60,
+    until: Annotated[
+        Literal['nearest', 'near', 'usual', 'all'],
+        typer.Option(help='Last round: 4 or 16 test files; all of `trainer test`; of `--all`.'),
+    ] = 'usual',
+    folder: Annotated[
+        Path, typer.Option(help='Keeps state and copy: an interrupted run goes on.')
+    ] = Path('.trainer/faults'),
+    seed: Seed = 0,
+) -> None:
+    """Plant small faults in kernels and nodes, one at a time: does a test find each?"""
+    from bench.faults.run import run_faults
+
+    checkout = Path(__file__).parents[1]
+    raise typer.Exit(int(run_faults(checkout, folder.resolve(), count, seed, until)))
 
 
 def _leave_with(failures: list[str]) -> None:
