@@ -1,6 +1,7 @@
 """The supervisor: what starts is ended, what dies is named, and nothing is left running."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,8 +15,6 @@ import pytest
 
 from cutting_trainer.session.node_process import CUT_OFF, NodeCommand
 from cutting_trainer.session.supervisor import Event, Supervisor
-
-pytestmark = pytest.mark.real_time
 
 FAKE = Path(__file__).with_name('fake_node.py')
 ROOT = FAKE.parents[1]
@@ -48,7 +47,7 @@ def _lives(pid: int) -> bool:
     return state != 'Z'
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 10.0) -> None:
+def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, 'it did not happen'
@@ -70,16 +69,10 @@ def commands(ledger: Ledger, **habits: str) -> list[NodeCommand]:
     return [command(name, ledger, *habits.get(name, '').split()) for name in ORDER]
 
 
-def later(seconds: float, action: Callable[[], object]) -> Callable[[float], None]:
-    """A tick that acts once."""
-    done = []
-
-    def tick(elapsed: float) -> None:
-        if elapsed > seconds and not done:
-            done.append(True)
-            action()
-
-    return tick
+def run_until(supervisor: Supervisor, condition: Callable[[], object]) -> None:
+    """Runs a session until something has happened, however long the machine takes for it."""
+    supervisor.run(60.0, tick=lambda _: not condition())
+    assert condition(), 'it did not happen'
 
 
 def test_recording_starts_before_all_others_and_ends_after_them(
@@ -88,10 +81,9 @@ def test_recording_starts_before_all_others_and_ends_after_them(
     nodes = commands(ledger, recorder='slow', tissue_sim='slow', emulated_arm='done')
     with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:
         assert supervisor.start()
-        supervisor.run(20.0, until_done='emulated_arm')
+        supervisor.run(60.0, until_done='emulated_arm')
         outcome = supervisor.end()
     assert outcome.ran and outcome.finished and not outcome.interrupted
-    assert outcome.seconds < 10.0
     assert not outcome.deaths and not outcome.killed
     assert ledger.entries('start')[0][0] == 'recorder'
     asked = dict(ledger.entries('SIGINT'))
@@ -107,7 +99,7 @@ def test_all_lines_of_a_node_are_in_its_log_and_warnings_are_told(
     nodes = [command('cutting', ledger, 'done')]
     with Supervisor(nodes, logs, ENVIRONMENT, told.append) as supervisor:
         assert supervisor.start()
-        supervisor.run(1.0)
+        run_until(supervisor, lambda: [event for event in told if event.kind == 'warning'])
     written = (logs / 'cutting.log').read_text().splitlines()
     assert written[:2] == ['cutting looks around', 'ready: cutting']
     assert written[-1] == '[WARN] [1.0] [cutting]: careful'
@@ -120,7 +112,7 @@ def test_time_limit_ends_a_session_that_never_says_done(tmp_path: Path, ledger: 
         supervisor.run(0.3, until_done='emulated_arm')
         outcome = supervisor.end()
     assert outcome.ran and not outcome.finished
-    assert 0.3 <= outcome.seconds < 2.0
+    assert outcome.seconds >= 0.3
     assert not ledger.running()
 
 
@@ -128,20 +120,19 @@ def test_node_killed_in_the_session_is_named_and_the_others_live(
     tmp_path: Path, ledger: Ledger
 ) -> None:
     told: list[Event] = []
-    alive: list[set[str]] = []
     logs = tmp_path / 'bag' / 'log'
     with Supervisor(commands(ledger), logs, ENVIRONMENT, told.append) as supervisor:
         assert supervisor.start()
-        pids = supervisor.pids
-        kill = later(0.1, lambda: os.kill(pids['tissue_sim'], signal.SIGKILL))
-        look = later(0.4, lambda: alive.append(set(ledger.running())))
-        supervisor.run(0.6, tick=lambda elapsed: [kill(elapsed), look(elapsed)])
+        supervisor.run(0.1)
+        os.kill(supervisor.pids['tissue_sim'], signal.SIGKILL)
+        run_until(supervisor, lambda: [event for event in told if event.kind == 'died'])
+        alive = set(ledger.running())
         outcome = supervisor.end()
     assert [death.node for death in outcome.deaths] == ['tissue_sim']
     assert outcome.deaths[0].returncode == -signal.SIGKILL
-    assert alive == [set(ORDER) - {'tissue_sim'}]
+    assert alive == set(ORDER) - {'tissue_sim'}
     sentence = next(event.text for event in told if event.kind == 'died')
-    assert sentence.startswith('tissue_sim died after 0.')
+    assert re.match(r'tissue_sim died after [\d.]+ s ', sentence)
     assert 'SIGKILL' in sentence and 'haptic_bridge' in sentence and sentence.endswith('go on')
     assert not ledger.running()
 
@@ -277,7 +268,7 @@ def test_signal_during_the_session_ends_everything(ledger: Ledger, number: signa
     launcher = launch(ledger)
     wait_for_line(launcher, 'running')
     os.killpg(launcher.pid, number)
-    assert launcher.wait(10) == 130
+    assert launcher.wait(60) == 130
     assert not ledger.running()
     asked = ledger.entries('SIGINT')
     assert sorted(name for name, _ in asked) == ['emulated_arm', 'haptic_bridge', 'recorder']
@@ -303,7 +294,7 @@ def test_interrupt_before_all_are_ready_ends_everything(ledger: Ledger) -> None:
     launcher = launch(ledger, 'mute')
     wait_for(lambda: ledger.entries('start'))
     group_interrupt(launcher)
-    assert launcher.wait(10) == 130
+    assert launcher.wait(60) == 130
     assert not ledger.running()
 
 
@@ -315,7 +306,7 @@ def test_interrupt_at_any_moment_of_the_start_leaves_nothing_running(
     wait_for_line(launcher, 'ready recorder')
     time.sleep(pause)
     group_interrupt(launcher)
-    assert launcher.wait(10) == 130
+    assert launcher.wait(60) == 130
     assert not ledger.running()
 
 
@@ -340,7 +331,7 @@ def test_second_interrupt_kills_the_slow_but_lets_the_recorder_finish(ledger: Le
     os.kill(recorder, signal.SIGKILL)
     assert launcher.stdout is not None
     assert launcher.stdout.read().splitlines()[-1] == 'over'
-    assert launcher.wait(10) == 130
+    assert launcher.wait(60) == 130
     assert not ledger.running()
 
 
@@ -352,7 +343,7 @@ def test_node_that_ends_soon_after_a_second_interrupt_is_not_killed(ledger: Ledg
     group_interrupt(launcher)
     assert launcher.stdout is not None
     said = launcher.stdout.read()
-    assert launcher.wait(10) == 130
+    assert launcher.wait(60) == 130
     assert 'killed' not in said
     assert len(ledger.entries('end')) == 3
 
@@ -364,7 +355,7 @@ def test_nothing_survives_a_killed_launcher_and_the_recorder_may_close_its_bag(
     wait_for_line(launcher, 'running')
     assert len(ledger.running()) == 3
     launcher.kill()
-    launcher.wait(10)
+    launcher.wait(60)
     wait_for(lambda: not ledger.running())
     assert [name for name, _ in ledger.entries('end')] == ['recorder']
     assert [name for name, _ in ledger.entries('SIGTERM')] == ['recorder']
@@ -404,14 +395,17 @@ def test_node_that_cannot_take_anothers_place_is_told_and_the_others_run(
 
 def test_node_that_converses_is_heard_and_answered(tmp_path: Path, ledger: Ledger) -> None:
     told: list[Event] = []
+
+    def messages() -> list[dict[str, object]]:
+        return [dict(event.content) for event in told if event.kind == 'message']
+
     node = replace(command('viewer', ledger, 'asks'), converses=True)
     with Supervisor([node], tmp_path / 'bag' / 'log', ENVIRONMENT, told.append) as supervisor:
         assert supervisor.start()
         supervisor.answer('viewer', 'yes')
-        supervisor.run(0.5)
+        run_until(supervisor, lambda: len(messages()) == 2)
         supervisor.answer('nobody', 'yes')
-    messages = [dict(event.content) for event in told if event.kind == 'message']
-    assert messages == [{'ask': 'may I?'}, {'answered': 'yes'}]
+    assert messages() == [{'ask': 'may I?'}, {'answered': 'yes'}]
 
 
 def test_messages_that_cannot_be_read_are_counted_and_end_nothing(
@@ -421,7 +415,7 @@ def test_messages_that_cannot_be_read_are_counted_and_end_nothing(
     nodes = [command('viewer', ledger, 'garbles')]
     with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT, told.append) as supervisor:
         assert supervisor.start()
-        supervisor.run(0.5)
+        run_until(supervisor, lambda: sum(event.kind == 'warning' for event in told) >= 3)
         assert supervisor.pids.keys() == {'viewer'}
     said = [event.text for event in told if event.kind == 'warning']
     assert said[0].startswith('a message could not be read')

@@ -126,7 +126,8 @@ def run_faults(checkout: Path, folder: Path, count: int, seed: int, last: str) -
     copy = Copy(checkout, folder)
     trials = load_trials(state, lambda: draw(copy.root, count, seed))
     for name in ROUNDS[: ROUNDS.index(last) + 1]:
-        for trial in trials:
+        # Those without kernels come first: nothing is compiled again for them.
+        for trial in sorted(trials, key=lambda trial: trial.fault.kernel):
             if is_due(trial, name):
                 try_round(trial, name, copy)
                 save_trials(state, trials)
