@@ -88,7 +88,9 @@ class Resistance:
             ways: along which the pieces are pulled, shape (p, 3).
         """
         sizes = np.maximum(np.linalg.norm(ways, axis=1), 1e-300)
-        sines = np.linalg.norm(np.cross(ways, edge), axis=1) / sizes
+        (x, y, z), (a, b, c) = ways.T, edge  # their product, at half the cost of np.cross
+        across = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=1)
+        sines = np.linalg.norm(across, axis=1) / sizes
         return np.asarray(piece * (fresh * self.toughness * sines + self.friction))
 
 
@@ -304,10 +306,11 @@ class Blade:
         rub = piece * self._resistance.friction * float(slid.sum())
         self.paid += float(limits @ slid) - rub
         self.rubbed += rub
-        before = self._knots()
+        cutting = bool((slid[fresh == 1] > _SETTLED).any())
+        before = self._knots() if cutting else self._points
         self._points = self._points.copy()
         self._points[self._inside] += ways
-        if (slid[fresh == 1] > _SETTLED).any():
+        if cutting:
             self._fracture.add(before, self._knots())
         else:
             self._fracture.leave()

@@ -82,13 +82,42 @@ class CutStrips:
         Returns:
             Their corners [m], shape (t, 3, 3).
         """
-        a, b = self._strips[:, :, :-1].reshape(-1, 2, KNOTS - 1, 3).transpose(1, 0, 2, 3)
-        c, d = self._strips[:, :, 1:].reshape(-1, 2, KNOTS - 1, 3).transpose(1, 0, 2, 3)
-        halves = [np.stack(half, axis=2).reshape(-1, 3, 3) for half in ((c, a, b), (c, b, d))]
-        corners = np.concatenate([opened, *halves])
         low, high = points.min(axis=0) - BLADE_THICKNESS, points.max(axis=0) + BLADE_THICKNESS
-        meets = (corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)
-        return np.ascontiguousarray(corners[meets.all(axis=1)])
+        found = np.empty((len(opened) + 2 * (KNOTS - 1) * len(self._strips), 3, 3))
+        return found[: _near(opened, np.ascontiguousarray(self._strips), low, high, found)]
+
+
+@inner
+def _meets(triangle, low, high):
+    """Return whether the bounding box of a triangle meets a box."""
+    for c in range(3):
+        x, y, z = triangle[0, c], triangle[1, c], triangle[2, c]
+        if max(max(x, y), z) < low[c] or min(min(x, y), z) > high[c]:
+            return False
+    return True
+
+
+@kernel
+def _near(opened, strips, low, high, found):
+    """Copy the triangles that meet a box, of the strips after the others; return their number.
+
+    Strips are divided between their knots: first come the halves with the edge before.
+    """
+    count = 0
+    for k in range(len(opened)):
+        if _meets(opened[k], low, high):
+            found[count] = opened[k]
+            count += 1
+    for half in range(2):
+        for k in range(len(strips)):
+            for i in range(strips.shape[2] - 1):
+                for c in range(3):
+                    found[count, 0, c] = strips[k, 0, i + 1, c]
+                    found[count, 1, c] = strips[k, half, i, c]
+                    found[count, 2, c] = strips[k, 1, i + half, c]
+                if _meets(found[count], low, high):
+                    count += 1
+    return count
 
 
 def _path_length(a: np.ndarray, b: np.ndarray) -> float:
@@ -98,15 +127,18 @@ def _path_length(a: np.ndarray, b: np.ndarray) -> float:
 @inner
 def _normal(triangle, normal):
     """Write the unit normal of a triangle's corners; return twice its area, 0 for a sliver."""
-    a = triangle[0]
-    u, v = triangle[1] - a, triangle[2] - a
-    normal[0] = u[1] * v[2] - u[2] * v[1]
-    normal[1] = u[2] * v[0] - u[0] * v[2]
-    normal[2] = u[0] * v[1] - u[1] * v[0]
+    # No arrays of its own: an allocation takes longer than all the rest.
+    x, y, z = triangle[0, 0], triangle[0, 1], triangle[0, 2]
+    u0, u1, u2 = triangle[1, 0] - x, triangle[1, 1] - y, triangle[1, 2] - z
+    v0, v1, v2 = triangle[2, 0] - x, triangle[2, 1] - y, triangle[2, 2] - z
+    normal[0] = u1 * v2 - u2 * v1
+    normal[1] = u2 * v0 - u0 * v2
+    normal[2] = u0 * v1 - u1 * v0
     size = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
     if size < 1e-14:
         return 0.0
-    normal /= size
+    for c in range(3):
+        normal[c] /= size
     return size
 
 
@@ -128,23 +160,23 @@ def _over(triangle, normal, size, x, y, z, reach):
 
 
 @inner
-def _surround(triangle, margin, sphere):
+def _surround(triangle, margin, spheres, k):
     """Write centre and squared radius of a sphere around a triangle, with a margin [m]."""
     largest = 0.0
     for c in range(3):
-        sphere[c] = (triangle[0, c] + triangle[1, c] + triangle[2, c]) / 3
+        spheres[c, k] = (triangle[0, c] + triangle[1, c] + triangle[2, c]) / 3
     for i in range(3):
         square = 0.0
         for c in range(3):
-            square += (triangle[i, c] - sphere[c]) ** 2
+            square += (triangle[i, c] - spheres[c, k]) ** 2
         largest = max(largest, square)
-    sphere[3] = (np.sqrt(largest) + margin) ** 2
+    spheres[3, k] = (np.sqrt(largest) + margin) ** 2
 
 
 @inner
-def _beyond(sphere, x, y, z):
-    square = (x - sphere[0]) ** 2 + (y - sphere[1]) ** 2 + (z - sphere[2]) ** 2
-    return square > sphere[3]
+def _beyond(spheres, k, x, y, z):
+    square = (x - spheres[0, k]) ** 2 + (y - spheres[1, k]) ** 2 + (z - spheres[2, k]) ** 2
+    return square > spheres[3, k]
 
 
 @kernel
@@ -164,17 +196,27 @@ def look_ahead(points, ways, triangles, reach, ahead, fresh):
         ahead: distance ahead of the points that is looked at [m].
         fresh: output, 1 where a point is pulled into uncut material, else 0, shape (p,).
     """
-    normals, sizes = np.empty((len(triangles), 3)), np.empty(len(triangles))
-    spheres = np.empty((len(triangles), 4))
+    # Others are too far from all points to be above or below any.
+    margin, kept = reach + ahead + _ROUNDING, np.empty_like(triangles)
+    low, high, count = np.empty(3), np.empty(3), 0
+    for c in range(3):
+        low[c], high[c] = points[:, c].min() - margin, points[:, c].max() + margin
     for k in range(len(triangles)):
+        if _meets(triangles[k], low, high):
+            kept[count] = triangles[k]
+            count += 1
+    triangles = kept[:count]
+    normals, sizes = np.empty((count, 3)), np.empty(count)
+    spheres = np.empty((4, count))
+    for k in range(count):
         sizes[k] = _normal(triangles[k], normals[k])
-        _surround(triangles[k], reach + _ROUNDING, spheres[k])
+        _surround(triangles[k], reach + _ROUNDING, spheres, k)
     along = np.empty(3)
     for i in range(len(points)):
         fresh[i] = 1.0
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for k in range(len(triangles)):
-            if sizes[k] == 0.0 or _beyond(spheres[k], x, y, z):
+            if sizes[k] == 0.0 or _beyond(spheres, k, x, y, z):
                 continue
             if _over(triangles[k], normals[k], sizes[k], x, y, z, reach):
                 off = ways[i, 0] * normals[k, 0] + ways[i, 1] * normals[k, 1]
@@ -203,7 +245,7 @@ def _is_fresh(point, way, ahead, triangles, normals, sizes, spheres, reach):
     part = ahead / length
     x, y, z = point[0] + part * way[0], point[1] + part * way[1], point[2] + part * way[2]
     for k in range(len(triangles)):
-        if sizes[k] == 0.0 or _beyond(spheres[k], x, y, z):
+        if sizes[k] == 0.0 or _beyond(spheres, k, x, y, z):
             continue
         across = normals[k, 0] * way[0] + normals[k, 1] * way[1] + normals[k, 2] * way[2]
         if abs(across) > _MAX_SINE_ALONG_CUT * length:

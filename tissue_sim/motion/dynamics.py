@@ -327,19 +327,25 @@ class Dynamics:
         spring = coupling.spring(self.mesh.rest)
         work, done, whole = 0.0, 0, np.array([[0, self.mesh.node_count]])
         part, parts = 1, 1 if tool is None else tool.parts
+        region: Region | None = None
+        adapt = 0
         while done < substeps:
-            region = self._active.choose(
-                self._u[:size],
-                moving,
-                self.material.beta,
-                self.inverse_mass,
-                coupling,
-                self._frame_time,
-            )
+            if region is None or not self._active.whole:
+                region = self._active.choose(
+                    self._u[:size],
+                    moving,
+                    self.material.beta,
+                    self.inverse_mass,
+                    coupling,
+                    self._frame_time,
+                )
             steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
             if self._stiffened is not None:
-                steps = min(steps, SUBSTEPS_BETWEEN)
-                self._stiffened.adapt(self._u[:size], moving, self.inverse_mass, begun=done == 0)
+                if done >= adapt:
+                    inverse = self.inverse_mass
+                    self._stiffened.adapt(self._u[:size], moving, inverse, begun=done == 0)
+                    adapt = done + SUBSTEPS_BETWEEN
+                steps = min(steps, adapt - done)
             if self.loads is not None:
                 steps = min(steps, self.loads.substeps(dt) or steps)
             steps = min(steps, max(part * substeps // parts - done, 1))
