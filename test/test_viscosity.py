@@ -8,6 +8,7 @@ from meshes import irregular_box
 
 from bench.accuracy.prony import shear_relaxation, uniaxial_creep, uniaxial_relaxation
 from bench.cuts.random_strokes import random_stroke
+from bench.figures.tissue_relaxation import cycle
 from cutting_trainer.cutting.method import Sweep
 from cutting_trainer.cutting.methods import make_method
 from cutting_trainer.cutting.settings import CuttingSettings
@@ -156,6 +157,11 @@ def test_work_of_a_cycle_is_what_is_stored_and_lost(name: ModelName) -> None:
     exact = np.pi * shear * loss * size**2 * SIDE**3
     # The terms have not all come to the steady state: exp(-1) of the slow one is left.
     assert viscosity.lost - start == pytest.approx(exact, rel=0.03)
+
+
+@every_model
+def test_work_of_a_large_cycle_is_accounted_for_while_points_change_over(name: ModelName) -> None:
+    assert cycle(name) < 0.01
 
 
 @pytest.mark.parametrize('integrator', ['symplectic_euler', 'rk4'])

@@ -25,6 +25,23 @@ def uniaxial_creep(material: Material, time: Floats) -> Floats:
     return _response(below, above, time)
 
 
+def series_of_creep(
+    growths: tuple[float, ...], times: tuple[float, ...]
+) -> tuple[tuple[float, float], ...]:
+    """Return g and tau [s] of the terms whose shear compliance grows by some shares.
+
+    Args:
+        growths: c of the compliance over its first value, 1 + sum of c (1 - exp(-t / rho)).
+        times: rho [s].
+    """
+    below = whole = _product(list(times))
+    for i, growth in enumerate(growths):
+        below = below + growth * _product([rho for j, rho in enumerate(times) if j != i])
+    poles = np.real(below.roots)
+    slope = below.deriv()
+    return tuple((float(whole(p) / slope(p) / p), float(-1 / p)) for p in poles)
+
+
 def _axial_modulus(material: Material) -> tuple[np.poly1d, np.poly1d]:
     """Return numerator and denominator of 9 K G / (3 K + G), with s times the transform of G."""
     e, nu = material.youngs_modulus, material.poissons_ratio

@@ -1,6 +1,7 @@
 """Figures of viscosity: relaxation, creep and energy against the Prony series' exact answers."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,13 +14,18 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 
 SIDE = 0.03
-SERIES = ((0.3, 0.1), (0.3, 1.0))
+Series = tuple[tuple[float, float], ...]
+SERIES: Series = ((0.3, 0.1), (0.3, 1.0))
+PULL = 400.0
+"""Acceleration of the weight that lengthens a cube [m/s^2]."""
 MODULI = (5400.0, 0.45)
 TIMES = 10
 FRAMES, SKIPPED = 20, 4
-CYCLE_STEPS = 200
+CYCLE_STEPS, CYCLE_SHEAR = 200, 0.12
+"""Steps and largest shear of a cycle, in which points change over to the law and back."""
 TIMED = 20
 
 
@@ -64,36 +70,61 @@ def relaxation(name: ModelName) -> float:
     return float(np.abs(forces / exact - 1).max())
 
 
-def creep() -> float:
-    """Return the largest relative error of the lengthening under a weight, in frames."""
-    # Light, and pulled hard: its inertia plays no part.
+def pulled(
+    name: ModelName, integrator: IntegratorName, series: Series
+) -> tuple[Dynamics, Callable[[], float]]:
+    """Return a cube under its weight from now on, and a function for its lengthening, relative to
+    the first one.
+
+    It is light, and pulled hard: its inertia plays no part.
+
+    Args:
+        name: elastic model.
+        integrator: name.
+        series: g and tau [s] of the terms.
+    """
     mesh = kuhn_block((3, 3, 3), (SIDE, SIDE, SIDE))
-    material = Material(*MODULI, 10.0, 200.0, 1e-4, 0.0, SERIES)
-    stepping = TimeStepping('symplectic_euler', max_substeps=5000)
-    dynamics = Dynamics(mesh, material, 'linear_smoothed', stepping, gravity=(0.0, 0.0, 400.0))
+    material = Material(*MODULI, 10.0, 200.0, 1e-4, 0.0, series)
+    stepping = TimeStepping(integrator, max_substeps=5000)
+    dynamics = Dynamics(mesh, material, name, stepping, gravity=(0.0, 0.0, PULL))
     dynamics.inverse_mass.reshape(-1, 3)[mesh.rest < 1e-9] = 0.0  # planes that slide in themselves
     top = mesh.rest[:, 2] > SIDE - 1e-9
     weight = np.zeros_like(mesh.rest)
-    weight[:, 2] = 400.0 * dynamics.model.mass
+    weight[:, 2] = PULL * dynamics.model.mass
     first = solve_static(dynamics.model, dynamics.inverse_mass > 0, weight)[top, 2].mean()
+    return dynamics, lambda: float(dynamics.displacement[top, 2].mean() / first)
+
+
+def creep() -> float:
+    """Return the largest relative error of the lengthening under a weight, in frames."""
+    dynamics, lengthened = pulled('linear_smoothed', 'symplectic_euler', SERIES)
     found = []
     for _ in range(FRAMES):
         dynamics.advance(Coupling())
-        found.append(dynamics.displacement[top, 2].mean())
-    exact = first * uniaxial_creep(material, np.arange(1, FRAMES + 1) / 30)
+        found.append(lengthened())
+    exact = uniaxial_creep(dynamics.material, np.arange(1, FRAMES + 1) / 30)
     return float(np.abs(np.array(found) / exact - 1)[SKIPPED:].max())
 
 
 def cycle(name: ModelName) -> float:
-    """Return what a cycle of shear has put in less what is stored and lost, relative to it."""
+    """Return what a cycle of shear has put in less what is stored and lost, relative to it.
+
+    What is lost must never fall; where it does, the result is infinite.
+    """
     dynamics, work, worst = block(name), 0.0, 0.0
     assert dynamics.loads is not None and dynamics.loads.viscosity is not None
     viscosity, force = dynamics.loads.viscosity, np.zeros_like(dynamics.mesh.rest)
     for k in range(1, CYCLE_STEPS + 1):
-        before, shear = dynamics.displacement.copy(), 0.03 * np.sin(2 * np.pi * k / CYCLE_STEPS)
+        before, shear = (
+            dynamics.displacement.copy(),
+            CYCLE_SHEAR * np.sin(2 * np.pi * k / CYCLE_STEPS),
+        )
         moved = after(dynamics, shear, 0.0)  # the viscous stress is that of before
         work += 0.5 * float(np.sum((force + moved) * (dynamics.displacement - before)))
+        lost = viscosity.lost
         force = after(dynamics, shear, 0.5 / CYCLE_STEPS)
+        if viscosity.lost < lost:
+            return np.inf
         if k in (CYCLE_STEPS // 4, CYCLE_STEPS):
             stored = dynamics.model.evaluate(dynamics.displacement)[1] + viscosity.energy
             worst = max(worst, abs(stored + viscosity.lost - work) / max(abs(work), stored))

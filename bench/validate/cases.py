@@ -16,6 +16,7 @@ TRUTH_CUBE = Source(
 MULTIS = Source(
     'SimTK Multis', 'simtk.org, multis wiki, Specifications/IndentationModeling, rev. 20', 'page'
 )
+KERDOK = Source('Kerdok, Ottensmeyer, Howe 2006', 'doi 10.1016/j.jbiomech.2005.07.005', 'abstract')
 QUADRATIC = Source('scikit-fem', 'quadratic hexahedra of the same law', 'computed')
 FAT = Source('Hatt et al. 2023', 'doi 10.1016/j.jmbbm.2023.105924', 'abstract')
 LIVER = Source('tissue table of 2019', 'doi 10.1088/1361-6560/ab5010, table 1', 'table')
@@ -25,7 +26,8 @@ CASES: dict[str, Case] = {
     for case in (
         Case(
             'toughness',
-            'Steady force of a blade, J times length of edge, at each published toughness',
+            'Steady force of a blade, J times the 5.5 mm of its edge in the tissue, at each '
+            'published toughness',
             (REVIEW, GOKGOL),
             0.10,
             'chosen here',
@@ -93,6 +95,15 @@ CASES: dict[str, Case] = {
             0.02,
             'chosen here; the model is published, its terms (0.3 in 0.1 s, 0.3 in 1 s) are not',
             relaxation.run_relaxation,
+        ),
+        Case(
+            'creep',
+            'Strain under a constant load, time constants of perfused porcine liver',
+            (KERDOK, Source('generalised Maxwell model', 'exact answer of the series', 'formula')),
+            0.02,
+            'chosen here; the time constants of 1.86 and 51.3 s are published, their shares (the '
+            'strain grows by a half in each) are not',
+            relaxation.run_creep,
         ),
     )
 }

@@ -1,16 +1,23 @@
-"""Relaxation after a step of shear, against the exact answer of the series."""
+"""Relaxation after a step of shear, and creep under a weight, against the series' exact answers."""
 
 import time
 
 import numpy as np
 
-from bench.accuracy.prony import shear_relaxation
-from bench.figures.tissue_relaxation import SIDE, after, block
+from bench.accuracy.prony import series_of_creep, shear_relaxation, uniaxial_creep
+from bench.figures.tissue_relaxation import SIDE, after, block, pulled
 from bench.validate.case import Result
+from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.models import MODELS
 
 SHEAR, TIMES = 0.02, (0.1, 0.5, 2.0)
 """Shear of the step, and seconds after it."""
+RETARDATION = (1.86, 51.3)
+"""Published time constants of porcine liver under a constant load [s]."""
+GROWTHS = (0.5, 0.5)
+"""Growth of the strain by each of them, relative to the first strain: chosen, not published."""
+CREEP_FRAMES = (60, 300, 1500)
+"""Frames at 30 Hz after which the strain is compared."""
 
 
 def run_relaxation(quick: bool) -> list[Result]:
@@ -29,4 +36,27 @@ def run_relaxation(quick: bool) -> list[Result]:
             name = f'force over the first, after {moment:g} s'
             results.append(Result(name, model, count, '', exact, found, found / exact - 1, cpu))
             last = moment
+    return results
+
+
+def run_creep(quick: bool) -> list[Result]:
+    """Return the growth of the strain under a constant load.
+
+    The nodes slide in planes, for which the mass of `stiffening` has no place. Its small strains
+    are those of `linear_smoothed`.
+    """
+    results = []
+    for model in MODELS:
+        if model == 'stiffening':
+            continue
+        dynamics, lengthened = pulled(model, 'implicit', series_of_creep(GROWTHS, RETARDATION))
+        count, start = len(dynamics.mesh.tetrahedra), time.thread_time()
+        for frame in range(1, CREEP_FRAMES[-1] + 1):
+            dynamics.advance(Coupling())
+            if frame not in CREEP_FRAMES:
+                continue
+            found, cpu = lengthened(), time.thread_time() - start
+            exact = float(uniaxial_creep(dynamics.material, np.array([frame / 30]))[0])
+            name = f'strain over the first, after {frame / 30:g} s'
+            results.append(Result(name, model, count, '', exact, found, found / exact - 1, cpu))
     return results

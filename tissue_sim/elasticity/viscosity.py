@@ -32,11 +32,15 @@ from cutting_trainer.tissue_sim.elasticity.rotation import (
     settle,
 )
 from cutting_trainer.tissue_sim.elasticity.simd import three
-from cutting_trainer.tissue_sim.elasticity.stiffening import MIN_RATIO, stiffening_stress
+from cutting_trainer.tissue_sim.elasticity.stiffening import (
+    MAX_EXPONENT,
+    MIN_RATIO,
+    stiffening_stress,
+)
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta, Touched, carried_over, grown
 
 KEPT = 7
-"""Numbers of a term at a node: s by xx, yy, zz, xy, xz, yz, and its stress by strain [Pa]."""
+"""Numbers of a term at a node: s by xx, yy, zz, xy, xz, yz, and its energy alone [Pa]."""
 LINEAR, TURNING, LAW = 0, 1, 2
 _ROTATION_TOLERANCE = 1e-9
 """[rad]; its square is the error of a stress."""
@@ -139,13 +143,38 @@ def _deviatoric(kind, law, r, f, p, t, e):
     _turned_back(r, p, t)
 
 
+@inner(error_model='numpy')
+def _conjugate(square, law):
+    """Return the energy by volume that belongs to a stress alone: s e - W(e) of its strain e [Pa].
+
+    In a deviatoric strain the law has W = mu / (2 b) (exp(y) - 1) with y = 2 b |e|^2, so that
+    2 y exp(2 y) = b |s|^2 / mu^2: Lambert's function, by the iteration of Iacono and Boyd (2017).
+
+    Args:
+        square: |s|^2 [Pa^2].
+        law: see `_deviatoric`; b 0 for the linear law.
+    """
+    mu, b = law[0], law[3]
+    z = b * square / (mu * mu)
+    if z < 1e-12:
+        return square / (4.0 * mu)
+    w = math.log1p(z)
+    for _ in range(4):
+        w = w / (1.0 + w) * (1.0 + math.log(z / w))
+    y = 0.5 * w
+    if y < MAX_EXPONENT:
+        return mu / (2.0 * b) * (2.0 * y * math.exp(y) - math.expm1(y))
+    rise = math.exp(MAX_EXPONENT)
+    y = 0.5 * z / (rise * rise)
+    return mu / (2.0 * b) * (rise * (y + MAX_EXPONENT - 1.0) + 1.0)
+
+
 @inner(error_model='numpy', fastmath=ORDERED_MATH)
-def _follow(kind, mu, series, rates, t, e, terms, i, total, out):
+def _follow(kind, law, series, rates, t, e, terms, i, total, out):
     """Let the terms of a node follow its stress.
 
     Args:
-        kind, t, e: see `_deviatoric`.
-        mu: shear modulus [Pa].
+        kind, law, t, e: see `_deviatoric`.
         series: g and tau [s] of the terms, shape (k, 2).
         rates: a = 1 - exp(-dt / tau) of the terms, shape (k,).
         terms: KEPT numbers for each term, changed at node i, shape (n, KEPT k).
@@ -153,36 +182,28 @@ def _follow(kind, mu, series, rates, t, e, terms, i, total, out):
         out: added to: energy and loss by volume [Pa]; raised: square of the largest |t - s|,
             shape (3,).
     """
-    modulus = 2.0 * mu
-    if kind == LAW:
-        now, size = 0.0, 0.0
-        for k in range(6):
-            twice = 1.0 if k < 3 else 2.0
-            now += twice * t[k] * e[k]
-            size += twice * e[k] * e[k]
-        if now > modulus * size:
-            modulus = now / size
     for k in range(6):
         total[k] = 0.0
     for term in range(rates.shape[0]):
         g, a, at = series[term, 0], rates[term], KEPT * term
-        change = square = gained = 0.0
+        change = square = gained = before = 0.0
         for k in range(6):
             twice = 1.0 if k < 3 else 2.0
-            before = terms[i, at + k]
-            away = t[k] - before
-            stress = before + a * away
+            away = t[k] - terms[i, at + k]
+            before -= twice * terms[i, at + k] * e[k]
+            stress = terms[i, at + k] + a * away
             terms[i, at + k] = stress
             total[k] += g * stress
             change += twice * away * away
             square += twice * stress * stress
             gained += twice * stress * e[k]
         out[2] = max(out[2], change)
-        by_strain = max(terms[i, at + 6], 2.0 * mu)
-        by_strain += a * (modulus - by_strain)
-        terms[i, at + 6] = by_strain
-        out[0] += g * (0.5 * square / by_strain - gained)
-        out[1] += g * (a - 0.5 * a * a) * change / modulus
+        before += terms[i, at + 6]
+        own = _conjugate(square, law) if kind == LAW else square / (4.0 * law[0])
+        terms[i, at + 6] = own
+        # In the same shape, what the terms store less is lost.
+        out[0] += g * (own - gained)
+        out[1] += g * (before - own + gained)
 
 
 @inner(error_model='numpy', fastmath=ORDERED_MATH)
@@ -243,7 +264,7 @@ def relieve(domains, nodes, spans, u, now, series, law, kind, load):
                     _matrix(nodes.rotation, i, r)
                 _deviatoric(kind, law, r, f, p, t, e)
                 out[0] = out[1] = 0.0
-                _follow(kind, law[0], series, rates, t, e, nodes.terms, i, total, out)
+                _follow(kind, law, series, rates, t, e, nodes.terms, i, total, out)
                 volume = domains.volume[i]
                 nodes.energy[i] = volume * out[0]
                 lost += volume * out[1]
