@@ -1,5 +1,11 @@
-"""Large strains of the stiffening law against quadratic elements of the same law."""
+"""Large strains of the stiffening law against quadratic elements of the same law.
 
+`./trainer run python -m bench.accuracy.law_problems [NAME ...]` prints one table: hours for all
+cases, minutes for one.
+"""
+
+import argparse
+import time
 from dataclasses import dataclass
 from functools import partial
 
@@ -7,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from bench.accuracy.law_reference import LawBlock, LawSolid, Motion
+from bench.accuracy.law_reference import MIN_PART, LawBlock, LawSolid, Motion
 from bench.accuracy.reference import graded
 from cutting_trainer.node_common.errors import MeshError
+from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import (
@@ -28,8 +35,8 @@ SLENDER = (0.02, 0.02, 0.08)
 """Bar that is bent [m]."""
 PATCH = 0.02
 """Edge of the square punch [m]."""
-MIN_PART = 1e-3
-"""Part of the load below which no equilibrium is tried."""
+STIFFENING, RATIOS, SEED = 6.0, (0.45, 0.49), 1
+"""b, Poisson's ratios, and seed of the meshes of the table."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,9 @@ class Case:
         motion: of the held places, for a share of the load.
         punched: whether only the punch on the upper side is held there, else all of it.
         steps: parts of the load.
+        mirrors: axes across which the motion is symmetric about the middle.
+        edge: mean edge of the table's meshes [m].
+        cells: of the table's reference, see `solved_reference`.
     """
 
     name: str
@@ -49,6 +59,9 @@ class Case:
     motion: Motion
     punched: bool = False
     steps: int = 6
+    mirrors: tuple[int, ...] = (0, 1)
+    edge: float = 0.004
+    cells: int = 6
 
     def held(self, points: Floats) -> Bools:
         """Return which points are held."""
@@ -98,12 +111,14 @@ def _cases() -> dict[str, Case]:
         ('press 50 %', cube, -0.5, False),
     ):
         motion = partial(lifted, height=size[2], most=most)
-        found.append(Case(name, size, motion, punched, max(3, round(abs(most) * 12))))
+        steps = max(3, round(abs(most) * 12))
+        edge, cells = (0.0025, 8) if punched else (0.004, 6)
+        found.append(Case(name, size, motion, punched, steps, edge=edge, cells=cells))
     bend = partial(_bent, size=SLENDER, most=np.pi / 2)
-    found.append(Case('bend 90', SLENDER, bend, steps=8))
+    found.append(Case('bend 90', SLENDER, bend, steps=8, mirrors=(1,), edge=0.0033))
     for angle in (45, 90):
         twist = partial(_twisted, size=cube, most=np.radians(angle))
-        found.append(Case(f'twist {angle}', cube, twist, steps=angle * 6 // 45))
+        found.append(Case(f'twist {angle}', cube, twist, steps=angle * 6 // 45, mirrors=()))
     return {case.name: case for case in found}
 
 
@@ -122,21 +137,24 @@ def solved_reference(case: Case, nu: float, stiffening: float, cells: int = 6) -
         case: of the motion.
         nu: Poisson's ratio.
         stiffening: b.
-        cells: of the grid along the shortest side; twice as many along a longer one.
+        cells: of the grid along the shortest side; 1.4 times as many along one twice as long.
     """
     size = case.size
+    parts = (4, 4, 1) if case.punched else (2, 2, 2)  # each of them has as many cells
     counts = [max(cells, round(cells * s / min(size) / 1.4)) for s in size]
+    counts = [k * max(round(count / k), 1) for k, count in zip(parts, counts, strict=True)]
     sides = (size[0] / 2 - PATCH / 2, size[0] / 2 + PATCH / 2) if case.punched else (0.0, size[0])
     ends = (size[2],) if case.punched else (0.0, size[2])
     axes = [graded(size[i], counts[i], sides) for i in range(2)]
     if case.name.startswith('bend'):
         axes = [np.linspace(0, s, cells // 2 + 1) for s in size[:2]]
-    block = LawBlock(
-        solid_of(case, nu, stiffening), (axes[0], axes[1], graded(size[2], counts[2], ends)),
-        case.held,
-    )  # fmt: skip
-    for step in range(1, case.steps + 1):
-        block.settle(case.motion, step / case.steps)
+    axes.append(graded(size[2], counts[2], ends))
+    for axis in case.mirrors:
+        middle = size[axis] / 2
+        axes[axis] = np.union1d(middle, axes[axis][axes[axis] > middle + 1e-9])
+    planes = axes[0], axes[1], axes[2]
+    block = LawBlock(solid_of(case, nu, stiffening), planes, case.held, case.mirrors)
+    block.follow(case.motion, case.steps)
     return block
 
 
@@ -281,3 +299,38 @@ def _force(case: Case, elastic: ElasticModel, u: Floats) -> float:
     mesh, d = elastic.mesh, 1e-6
     rate = (case.motion(mesh.rest, 1 + d) - case.motion(mesh.rest, 1 - d)) / (2 * d)
     return float((elastic.force(u) * rate)[mesh.fixed == 1].sum())
+
+
+def main() -> None:
+    """Print the table: each case at both Poisson's ratios."""
+    parser = argparse.ArgumentParser(prog='bench.accuracy.law_problems', description=main.__doc__)
+    parser.add_argument('names', nargs='*', metavar='NAME', help=f'of {", ".join(CASES)}')
+    names = parser.parse_args().names or list(CASES)
+    for name in names:
+        if name not in CASES:
+            parser.error(f'there is no case {name!r}: there are {", ".join(CASES)}')
+    print(f'b {STIFFENING:g}, against quadratic hexahedra; bounds: force 5 %, field 7 %\n')
+    print(
+        '| problem | nu | tetrahedra | force error | field error | CPU [s] | reference, CPU [s] |'
+    )
+    print('|---|---|---|---|---|---|---|', flush=True)
+    for name in names:
+        for nu in RATIOS:
+            print(f'| {name} | {nu:g} | {_row(CASES[name], nu)} |', flush=True)
+
+
+def _row(case: Case, nu: float) -> str:
+    start = time.process_time()
+    try:
+        block = solved_reference(case, nu, STIFFENING, case.cells)
+        middle = time.process_time()
+        found = compared(case, block, nu, case.edge, SEED)
+    except (SessionError, MeshError) as error:
+        return f'none: {error} | | | |'
+    errors = f'{100 * found.force:+.1f} % | {100 * found.field:.1f} %'
+    cpu = f'{time.process_time() - middle:.0f} | {middle - start:.0f}'
+    return f'{found.tetrahedra} | {errors} | {cpu}'
+
+
+if __name__ == '__main__':
+    main()

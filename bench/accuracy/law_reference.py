@@ -5,6 +5,7 @@ by tensors instead of components, so that an error of the trainer's law does not
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,9 @@ from cutting_trainer.session.errors import SessionError
 Floats = NDArray[np.float64]
 Motion = Callable[[Floats, float], Floats]
 """Displacement of held places [m], of their positions, shape (k, 3), and a share of the load."""
+
+MIN_PART = 1e-3
+"""Part of the load below which no equilibrium is tried."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,8 @@ class LawBlock:
         solid: the block.
         axes: planes of the grid along x, y and z [m].
         held: which of some places are held, by position, shape (k, 3).
+        mirrors: axes across which solid and motion are symmetric. Their planes begin in the
+            middle, so that the grid is a half or a quarter.
     """
 
     def __init__(
@@ -88,8 +94,10 @@ class LawBlock:
         solid: LawSolid,
         axes: tuple[Floats, Floats, Floats],
         held: Callable[[Floats], NDArray[np.bool_]],
+        mirrors: tuple[int, ...] = (),
     ) -> None:
         self.solid = solid
+        self._mirrors = mirrors
         mesh = skfem.MeshHex.init_tensor(*axes)
         basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=5)
         self._gradients = np.stack([np.asarray(field[0].grad) for field in basis.basis])
@@ -103,6 +111,8 @@ class LawBlock:
             for axis in range(3):
                 self._axis[dofs[axis]] = axis
         self._held = held(places)
+        for axis in mirrors:
+            self._held |= (self._axis == axis) & (places[:, axis] < solid.size[axis] / 2 + 1e-9)
         d, e, q = len(self._dofs), self._dofs.shape[1], self._weights.shape[1]
         # Element by element: derivatives by component and point, shape (e, d, 9 q).
         self._local = np.moveaxis(self._gradients.reshape(d, 9, e, q), 2, 0).reshape(e, d, 9 * q)
@@ -134,7 +144,7 @@ class LawBlock:
         return force, matrix, float((energy.reshape(e, q) * w).sum())
 
     def settle(self, motion: Motion, share: float) -> float:
-        """Move the held places, and the others to equilibrium; return the energy [J].
+        """Move the held places, and the others to equilibrium; return the energy of the grid [J].
 
         Args:
             motion: of the held places.
@@ -166,6 +176,33 @@ class LawBlock:
                 return energy
         raise SessionError('the reference has no equilibrium')
 
+    def follow(self, motion: Motion, steps: int) -> None:
+        """Move the held places from rest to the end of a motion, in parts.
+
+        A part that finds no equilibrium is halved; the next one starts along the last one's way.
+
+        Args:
+            motion: of the held places.
+            steps: parts, if none is halved.
+
+        Raises:
+            SessionError: no equilibrium is found on the way.
+        """
+        done, part, rate = 0.0, 1 / steps, np.zeros_like(self.u)
+        while done < 1 - 1e-9:
+            share, before = min(done + part, 1.0), self.u.copy()
+            try:
+                with suppress(SessionError):
+                    self._go(np.where(self._held, 0.0, (share - done) * rate))
+                self.settle(motion, share)
+            except SessionError:
+                self.u, part, rate = before, part / 2, 0.0 * rate
+                if part < MIN_PART:
+                    raise
+                continue
+            rate = (self.u - before) / (share - done)
+            done = share
+
     def _go(self, step: Floats) -> None:
         for part in 0.5 ** np.arange(8):
             try:
@@ -188,7 +225,7 @@ class LawBlock:
         d = 1e-6
         rate = (motion(self._place, share + d) - motion(self._place, share - d)) / (2 * d)
         along = rate[np.arange(len(self._axis)), self._axis]
-        return float(force[self._held] @ along[self._held])
+        return 2 ** len(self._mirrors) * float(force[self._held] @ along[self._held])
 
     def displacement(self) -> tuple[Floats, Floats]:
         """Return places [m] and their displacement [m], shape (k, 3)."""
@@ -199,6 +236,11 @@ class LawBlock:
 
     def at(self, points: Floats) -> Floats:
         """Return the displacement at points [m], shape (k, 3), by quadratic interpolation."""
+        points, turned = points.copy(), np.ones_like(points)
+        for axis in self._mirrors:
+            away = points[:, axis] - self.solid.size[axis] / 2
+            turned[:, axis] = np.where(away < 0.0, -1.0, 1.0)
+            points[:, axis] += np.abs(away) - away
         places, u = self.displacement()
         axes: Sequence[Floats] = [np.unique(places[:, i]) for i in range(3)]
         grid = np.zeros((*(len(a) for a in axes), 3))
@@ -217,4 +259,4 @@ class LawBlock:
                     w = weights[0][1][i] * weights[1][1][j] * weights[2][1][k]
                     at = weights[0][0] + i, weights[1][0] + j, weights[2][0] + k
                     result += w[:, None] * grid[at]
-        return result
+        return turned * result
