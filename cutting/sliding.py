@@ -131,9 +131,11 @@ def _volume_gradient(star, rest, at, where, out):
 
 
 @inner
-def _surface_normals(node, links, rest):
+def _surface_normals(node, links, rest, at, where):
     """Return unit normals of the surface triangles at a node, then 1 for an earlier cut, shape (k,
     4).
+
+    Nodes that have a row in `at` lie at that row of `where`.
     """
     first_corner, corner_next, face_triangle = (
         links.first_corner,
@@ -149,12 +151,15 @@ def _surface_normals(node, links, rest):
         corner = corner_next[corner]
     normals = np.empty((count, 4))
     count = 0
+    a, b, c = np.empty(3), np.empty(3), np.empty(3)
     corner = first_corner[node]
     while corner >= 0:
         for face in range(4):
             k = face_triangle[corner // 4, face]
             if face != corner % 4 and k >= 0:
-                a, b, c = rest[triangles[k, 0]], rest[triangles[k, 1]], rest[triangles[k, 2]]
+                _put(a, triangles[k, 0], rest, at, where)
+                _put(b, triangles[k, 1], rest, at, where)
+                _put(c, triangles[k, 2], rest, at, where)
                 ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
                 vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
                 x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -205,7 +210,7 @@ def _along(direction, plane, least, way):
 
 
 @inner
-def find_slide(star, plane, links, rest, fixed, shape, at, where, way):
+def find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
     """Find the shortest path of a node onto the swept surface that preserves outer shape and
     volume.
 
@@ -221,6 +226,7 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, way):
         fixed: shape (n,).
         shape: largest distance of the node from the present surface [m].
         at, where: row by node, and places [m], shape (j, 3), of nodes that slide in this batch.
+        outline: as `at`, of the nodes whose slide has changed the tissue's surface already.
         way: output [m], shape (3,).
 
     Returns:
@@ -229,7 +235,7 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, way):
     node = star[0, 0]
     if fixed[node]:
         return False
-    normals = _surface_normals(node, links, rest)
+    normals = _surface_normals(node, links, rest, outline, where)
     if len(normals) == 0:
         return _along(plane[:3], plane, 0.0, way)
     across = np.zeros(3)
@@ -286,6 +292,8 @@ def can_slide(star, plane, links, tables, rest, fixed, shape, floor):
     """
     at: dict[int, int] = {}
     at[-1] = 0
+    outline: dict[int, int] = {}
+    outline[-1] = 0
     where = np.empty((3 * len(star), 3))
     count = 0
     for k in range(len(star)):
@@ -299,7 +307,7 @@ def can_slide(star, plane, links, tables, rest, fixed, shape, floor):
                     where[count, j] = rest[node, j] - there[3] * there[j]
                 count += 1
     way = np.empty(3)
-    if not find_slide(star, plane, links, rest, fixed, shape, at, where, way):
+    if not find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
         return False
     return stays_sound(star, rest[star[0, 0]] + way, rest, floor, at, where)
 
@@ -371,7 +379,7 @@ def slides(rows, links, tables, rest, fixed, limits):
             continue
         node = tables.node_id[row]
         star = incident_tetrahedra(node, links, tables)
-        if not find_slide(star, plane, links, rest, fixed, limits.shape, at, where, way):
+        if not find_slide(star, plane, links, rest, fixed, limits.shape, at, where, at, way):
             continue
         nodes, weights = tables.slide_to[row], tables.slide[row]
         if not _express(node, rest[node] + way, links, rest, nodes, weights):

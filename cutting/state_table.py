@@ -259,8 +259,10 @@ def put_on_cut(tables, parent, fresh, positions):
                 tables.node_plane[row, i] = tables.edge_normal[edge, i]
                 gap = positions[other, i] - positions[node, i]
                 tables.node_plane[row, 3] -= part * gap * tables.edge_normal[edge, i]
-            for k in fresh:
-                if node in (tables.edge_nodes[k, 0], tables.edge_nodes[k, 1]):
+            for k in range(tables.counts[EDGES]):
+                # Also of an edge that the blade has not left yet: it ends on the cut now.
+                crossed = tables.edge_state[k] == DONE or tables.edge_state[k] == PENDING
+                if crossed and node in (tables.edge_nodes[k, 0], tables.edge_nodes[k, 1]):
                     tables.edge_state[k] = WAITS_PLUS
             tables.node_side[row], tables.node_state[row] = SNAPPED, DONE
             found.append(row)

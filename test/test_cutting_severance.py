@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 from strokes import draw, method_named
 
-from bench.cuts.curves import Cut, Organ, circle, curved, four_lines, organ_of, scattered, slab
+from bench.cuts.curves import (
+    Cut,
+    Organ,
+    circle,
+    curved,
+    four_lines,
+    liver,
+    organ_of,
+    scattered,
+    slab,
+)
 from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free
 from bench.cuts.strokes import good_block
 from cutting_trainer.cutting.checks import check_mesh, cut_face_area
@@ -52,11 +62,30 @@ def test_four_lines_free_a_square(plate):
     assert run.error == '' and run.faces == 0 and run.free
 
 
-def test_slivers_are_cut_at_their_nodes():
+@pytest.fixture(scope='module')
+def cloud() -> Organ:
+    return scattered()
+
+
+def test_slivers_are_cut_at_their_nodes(cloud):
     """Flat elements cannot be divided; the tissue does not stay connected there."""
-    organ = scattered()
+    organ = cloud
     run = measure(organ, circle(organ, 3, np.random.default_rng(1)))
     assert run.error == '' and run.free and run.said == ()
+
+
+@pytest.mark.parametrize('seed', [1001, 1004, 1006])
+def test_a_crossing_around_the_blade_may_end_at_a_node_put_on_the_cut(cloud, seed):
+    """A flat element puts its node on the cut, while the blade is still in another of its edges."""
+    run = measure(cloud, curved(cloud, 'spiral', np.random.default_rng(seed)))
+    assert run.error == '' and run.faces == 0
+
+
+def test_nodes_that_slide_beside_each_other_keep_the_volume():
+    """The end of an old cut slides along the outline as its neighbour has left it."""
+    organ = liver()
+    cut = four_lines(organ, 4, np.random.default_rng(13))
+    assert cut_mesh(organ, Cut(cut.paths[:2]))[2] == ''
 
 
 @pytest.mark.parametrize('depth', [0.005, 0.02, 0.05])

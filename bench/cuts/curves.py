@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay
+from scipy.spatial import Delaunay, cKDTree
 
 from bench.cuts.strokes import CELL_M, good_block
 from cutting_trainer.session.scene import load_scene
@@ -61,20 +61,30 @@ def liver() -> Organ:
     return organ_of('liver', nodes, tetrahedra.astype(np.int64))
 
 
+def _apart(nodes: Floats, candidates: Floats, distance: float) -> Floats:
+    """Return the nodes with each further candidate that is apart from all before it [m]."""
+    far = np.ones(len(candidates), bool)
+    if len(nodes):
+        far = cKDTree(nodes).query(candidates)[0] > distance
+    candidates = candidates[far]
+    near = cKDTree(candidates).query_ball_point(candidates, distance)
+    kept = np.zeros(len(candidates), bool)
+    for k, others in enumerate(near):
+        kept[k] = not kept[others].any()
+    return np.concatenate([nodes, candidates[kept]])
+
+
 def scattered() -> Organ:
     """Return a flat ellipsoid, the Delaunay mesh of scattered points: some elements are slivers."""
     rng = np.random.default_rng(77)
     axes = np.array([0.045, 0.045, 0.014])
     distance = 0.0044
-    found: list[Floats] = []
+    nodes = np.empty((0, 3))
     for radius, tries in ((1.0, 30000), (None, 60000)):
         directions = rng.normal(size=(tries, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         size = 1.0 if radius else rng.uniform(0, 1, (tries, 1)) ** (1 / 3) * 0.9
-        for point in directions * size * axes:
-            if not found or np.min(np.sum((np.array(found) - point) ** 2, axis=1)) > distance**2:
-                found.append(point)
-    nodes = np.array(found)
+        nodes = _apart(nodes, directions * size * axes, distance)
     tetrahedra = Delaunay(nodes).simplices.astype(np.int64)
     a, b, c, d = (nodes[tetrahedra[:, i]] for i in range(4))
     volume = np.einsum('ij,ij->i', np.cross(b - a, c - a), d - a)
