@@ -58,20 +58,20 @@ class Account:
         received: by the recorder.
         written: to the disk.
         lost: in transport, by their sequence numbers, or not taken by the disk.
-        unheard: missed before subscription.
+        missed: missed before subscription.
     """
 
     received: int
     written: int
     lost: int
-    unheard: int
+    missed: int
 
     @property
     def sentence(self) -> str:
         """Return the numbers as a phrase for the user."""
         parts = [f'{self.received} received', f'{self.written} written', f'{self.lost} lost']
-        if self.unheard:
-            parts.append(f'{self.unheard} missed before subscription')
+        if self.missed:
+            parts.append(f'{self.missed} missed before subscription')
         return ', '.join(parts)
 
 
@@ -309,7 +309,7 @@ class Recorder(ManagedNode):
                 received=stream.counter.received,
                 written=written.get(topic, 0),
                 lost=stream.counter.lost + refused.get(topic, 0),
-                unheard=stream.counter.before,
+                missed=stream.counter.before,
             )
             for topic, stream in self._streams.copy().items()  # the loop may add one meanwhile
         }

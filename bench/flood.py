@@ -55,11 +55,11 @@ class Flood:
 
     def begin(self) -> None:
         """Start to send."""
-        self._tell('on')
+        self._send('on')
 
     def pause(self) -> None:
         """Stop to send, wait until all words are acknowledged, and count."""
-        self._tell('off')
+        self._send('off')
         words, seconds = self._answer().split()
         self.acknowledged += int(words)
         self.seconds += float(seconds)
@@ -70,7 +70,7 @@ class Flood:
         self._process.stdin.close()
         self._process.wait(10.0)
 
-    def _tell(self, word: str) -> None:
+    def _send(self, word: str) -> None:
         assert self._process.stdin is not None
         self._process.stdin.write(f'{word}\n')
         self._process.stdin.flush()

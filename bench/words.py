@@ -58,7 +58,7 @@ def replaced_names() -> list[str]:
     found = []
     for path, tree in sources():
         for line, name in names(tree):
-            if name in ALLOWED or (name.islower() and '_' not in name):
+            if name in ALLOWED:
                 continue
             for part in NAME_PART.findall(name):
                 term = REPLACED.get(part.lower()) or (BOUNDS.get(part) if part.isupper() else None)

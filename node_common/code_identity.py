@@ -76,18 +76,18 @@ class CodeIdentity:
         Args:
             here: the code of this process.
         """
-        told = []
+        found = []
         if self.kernels != here.kernels:
-            told.append(
+            found.append(
                 f"the trainer's own kernels have changed: bag {self._code()}, here {here._code()}"
             )
         for name in ('numba', 'llvmlite', 'numpy', 'python'):
             then, now = getattr(self, name), getattr(here, name)
             if then != now:
-                told.append(f'{_WORDS[name]} has another version: bag {then}, here {now}')
+                found.append(f'{_WORDS[name]} has another version: bag {then}, here {now}')
         if (self.target, self.features) != (here.target, here.features):
-            told.append(f'the processor is another one: bag {self._processor(here)}')
-        return told
+            found.append(f'the processor is another one: bag {self._processor(here)}')
+        return found
 
     def rounds_otherwise_only(self, here: 'CodeIdentity') -> bool:
         """Return whether the processor or libraries differ, but not the trainer's own code."""

@@ -137,15 +137,15 @@ def _verify(bag: Bag, scene: Scene, *, as_json: bool) -> Status:
         took = time.monotonic() - began
     code = recorded_code(bag.custom_data)
     if as_json:
-        told = asdict(result) | {'identical': result.identical, 'computed_in': took}
-        told['code'] = {
+        report = asdict(result) | {'identical': result.identical, 'computed_in': took}
+        report['code'] = {
             'bag': code and asdict(code),
             'here': asdict(identity_here()),
             'differences': code and code.differences(identity_here()),
         }
         if result.difference and math.isinf(result.difference.size):
-            told['difference']['size'] = None
-        print(json.dumps(told, indent=2))
+            report['difference']['size'] = None
+        print(json.dumps(report, indent=2))
     else:
         lines = [*verdict(result, took, code), escape(repair_note(bag.custom_data))]
         console.print(*filter(None, lines), sep='\n', highlight=False)
@@ -232,8 +232,8 @@ def _experiment(
         after = run_experiment(bag, changed, recomputation(changed, beginning, changed=True))
     if as_json:
         runs = {'recorded': before.figures(), 'changed': after.figures()}
-        told = {'changes': dict(changes), 'differs_from_frame': differs, **runs}
-        print(json.dumps(told, indent=2))
+        report = {'changes': dict(changes), 'differs_from_frame': differs, **runs}
+        print(json.dumps(report, indent=2))
     else:
         Console().print(before.table(after, changes))
     return Status.OK

@@ -58,7 +58,7 @@ class Evidence:
         statuses: all statuses of /diagnostics.
         messages: number of messages, by topic.
         lost: number of messages missing after the first received one, by topic.
-        unheard: number of messages published before the first received one, by topic.
+        missed: number of messages published before the first received one, by topic.
     """
 
     bag: Path
@@ -69,7 +69,7 @@ class Evidence:
     statuses: list[Status] = field(default_factory=list)
     messages: dict[str, int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
-    unheard: dict[str, int] = field(default_factory=dict)
+    missed: dict[str, int] = field(default_factory=dict)
 
 
 def read_evidence(folder: Path) -> Evidence:
@@ -103,7 +103,7 @@ def read_evidence(folder: Path) -> Evidence:
     evidence.contacts = np.array(contacts, float).reshape(-1, 2)
     evidence.forces = np.array(forces, float).reshape(-1, 2)
     evidence.lost = {topic: c.lost for topic, c in counters.items() if c.lost}
-    evidence.unheard = {topic: c.before for topic, c in counters.items() if c.before}
+    evidence.missed = {topic: c.before for topic, c in counters.items() if c.before}
     return evidence
 
 

@@ -21,7 +21,7 @@ from cutting_trainer.session.supervisor import Event, Supervisor
 from cutting_trainer.session.terminal import session_console
 
 _FOREVER = 1e9
-_COLUMNS = ('received', 'written', 'lost', 'unheard')
+_COLUMNS = ('received', 'written', 'lost', 'missed')
 
 
 def run_recorder(
@@ -69,7 +69,7 @@ def _run(
     account: dict[str, Any] = {}
     began = time.monotonic()
 
-    def tell(event: Event) -> None:
+    def on_event(event: Event) -> None:
         if event.kind == 'message':
             message = event.content
             account.update(message if 'bag' in message else {})
@@ -85,7 +85,7 @@ def _run(
 
     with (
         notes.status('starting') as status,
-        Supervisor([command], bag / 'log', node_environment(domain), tell) as supervisor,
+        Supervisor([command], bag / 'log', node_environment(domain), on_event) as supervisor,
     ):
         if supervisor.start():
             supervisor.run(_FOREVER, tick=tick)
@@ -97,7 +97,7 @@ def account_table(account: dict[str, Any]) -> Table:
     table = Table(title=f'{escape(account["bag"])}, {account["bytes"] / 1e6:.1f} MB')
     table.add_column('topic', overflow='fold')
     for word in _COLUMNS:
-        title = 'missed before subscription' if word == 'unheard' else word
+        title = 'missed before subscription' if word == 'missed' else word
         table.add_column(title, justify='right')
     for topic, counts in account['topics'].items():
         table.add_row(escape(topic), *(str(counts[word]) for word in _COLUMNS))

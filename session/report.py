@@ -52,7 +52,7 @@ def _cells(node: NodeSummary) -> tuple[str, ...]:
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     lost = ', '.join(f'{count} of {topic}' for topic, count in summary.lost.items())
-    unheard = sum(summary.unheard.values())
+    missed = sum(summary.missed.values())
     rows = [
         ('duration', f'{summary.duration:.1f} s'),
         ('contact', f'{summary.contact_time:.1f} s'),
@@ -61,8 +61,8 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ('messages recorded', str(summary.messages)),
         ('messages lost', (lost or '0') + ('' if summary.complete else ' before the bag ends')),
     ]
-    if unheard:
-        rows.append(('sent before recording', str(unheard)))
+    if missed:
+        rows.append(('sent before recording', str(missed)))
     refused = {n.real_time for n in summary.nodes.values() if n.real_time and not n.has_real_time}
     rows += [('note', sentence) for sentence in sorted(refused)]
     return [*rows, ('bag', summary.bag)]

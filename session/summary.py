@@ -73,7 +73,7 @@ class Summary:
             None if the bag ends earlier.
         elements_cut: number of elements that the tissue reports as cut.
         messages: number of recorded messages.
-        lost, unheard: counts by topic, see `Evidence`.
+        lost, missed: counts by topic, see `Evidence`.
     """
 
     bag: str
@@ -87,7 +87,7 @@ class Summary:
     elements_cut: int
     messages: int
     lost: dict[str, int]
-    unheard: dict[str, int]
+    missed: dict[str, int]
 
     def plain(self) -> dict[str, Any]:
         """Return the figures for JSON: NaN becomes None."""
@@ -119,7 +119,7 @@ def summarise(evidence: Evidence) -> Summary:
         elements_cut=_elements_cut(evidence.statuses),
         messages=sum(evidence.messages.values()),
         lost=evidence.lost,
-        unheard=evidence.unheard,
+        missed=evidence.missed,
     )
 
 

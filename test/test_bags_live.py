@@ -278,9 +278,9 @@ def test_record_says_of_each_topic_what_came_was_written_was_lost_and_was_sent_b
     assert f'recording into {bag}; Ctrl-C ends it' in notes
     account = json.loads(said)
     assert account['bag'] == str(bag) and account['failure'] == ''
-    whole = {'received': 500, 'written': 500, 'lost': 0, 'unheard': 0}
+    whole = {'received': 500, 'written': 500, 'lost': 0, 'missed': 0}
     assert account['topics']['/stream'] == whole
-    assert account['topics']['/early'] == {'received': 1, 'written': 1, 'lost': 0, 'unheard': 1}
+    assert account['topics']['/early'] == {'received': 1, 'written': 1, 'lost': 0, 'missed': 1}
     described = open_bag(bag).custom_data
     assert described['scene'] == find_scene('block').read_text() and described['seed'] == '7'
 

@@ -85,7 +85,7 @@ def test_a_bad_profile_is_refused_with_file_key_and_what_would_be_right(tmp_path
 def test_a_convention_maps_motion_force_and_power_alike(device, position, turn, velocity, force):
     convention = DeviceConvention(device)
     pose = (*position, *turn.as_quat())
-    spoken = convention.spoken_pose(pose)
+    spoken = convention.to_device_pose(pose)
     assert_allclose(convention.pose(StampedMessage(1, '', spoken)).values, pose, atol=1e-12)
     mirror = np.array([-1.0 if axis == device.mirrored_axis else 1.0 for axis in 'xyz'])
     unit = UNITS[device.length_unit]
@@ -93,7 +93,7 @@ def test_a_convention_maps_motion_force_and_power_alike(device, position, turn, 
     # A vector that is turned and then mirrored is one that is mirrored and then turned as spoken.
     theirs = Rotation.from_quat(spoken[3:])
     assert_allclose(theirs.apply(mirror * velocity), mirror * turn.apply(velocity), atol=1e-9)
-    linear = convention.spoken_twist((*velocity, 0.0, 0.0, 0.0))[:3]
+    linear = convention.to_device_twist((*velocity, 0.0, 0.0, 0.0))[:3]
     wrench = convention.force((*force, *velocity))
     assert_allclose(
         device.force_sign * unit * np.dot(linear, wrench[:3]), np.dot(velocity, force), atol=1e-9
@@ -107,10 +107,10 @@ def test_angular_velocity_is_that_of_the_spoken_orientation(device, turn, omega)
     step = 1e-4
     later = Rotation.from_rotvec(np.multiply(step, omega)) * turn
     before, after = (
-        Rotation.from_quat(convention.spoken_pose((0.0, 0.0, 0.0, *r.as_quat()))[3:])
+        Rotation.from_quat(convention.to_device_pose((0.0, 0.0, 0.0, *r.as_quat()))[3:])
         for r in (turn, later)
     )
-    spoken = convention.spoken_twist((0.0, 0.0, 0.0, *omega))[3:]
+    spoken = convention.to_device_twist((0.0, 0.0, 0.0, *omega))[3:]
     assert_allclose((after * before.inv()).as_rotvec() / step, spoken, atol=1e-6)
 
 
@@ -128,7 +128,7 @@ def test_what_a_device_speaks_changes_nothing_in_what_the_hand_feels(frame, axis
         )
         for tick in range(1, 60):
             depth = transform.to_device(np.array([0.0, 0.0, 0.006 - 1e-4 * tick]))
-            spoken = convention.spoken_pose((*depth.tolist(), *turn.as_quat().tolist()))
+            spoken = convention.to_device_pose((*depth.tolist(), *turn.as_quat().tolist()))
             sample = (tick, tick, 1, tick, 0, tick, 0, *(0.0,) * 18, 0)
             wrench = path.tick(
                 tick * 1_000_000,

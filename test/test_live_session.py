@@ -136,7 +136,7 @@ def test_losses_on_diagnostics_are_topic_by_topic_those_of_the_sequence_numbers(
     heard, written = (int(counts[f'{word} {CONTACT}']) for word in ('received', 'written'))
     assert 0 < written <= heard <= len(numbers)
     for topic in (MEASURED_CP, SERVO_CF, TISSUE_FORCE):
-        assert f'lost {topic}' in counts and f'unheard {topic}' in counts
+        assert f'lost {topic}' in counts and f'missed {topic}' in counts
 
 
 def test_there_is_no_force_before_the_first_contact_and_none_after_the_last(

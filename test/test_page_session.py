@@ -115,7 +115,7 @@ def trainer(*arguments: str) -> str:
 
 def test_recording_begins_in_the_middle_of_a_cut(made: Made) -> None:
     assert made.status == 0
-    assert made.before['parts']['tissue']['lips'] > 0  # the tissue was open already
+    assert made.before['parts']['tissue']['cutEdges'] > 0  # the tissue was open already
     recording = Recording(made.bag)
     assert recording.complete
     _, states = recording.read('/tool/contact', ContactCodec(), 'state')
@@ -123,8 +123,8 @@ def test_recording_begins_in_the_middle_of_a_cut(made: Made) -> None:
 
 
 def test_the_recorded_drag_cuts_further(made: Made) -> None:
-    lips = [state['parts']['tissue']['lips'] for state in (made.before, made.after)]
-    assert lips[1] > lips[0]
+    edges = [state['parts']['tissue']['cutEdges'] for state in (made.before, made.after)]
+    assert edges[1] > edges[0]
     recording = Recording(made.bag)
     _, tips = recording.read('/tool/contact', ContactCodec(), 'device')
     assert tips[-1, 0] - tips[0, 0] > 0.6 * ALONG
@@ -165,7 +165,11 @@ def test_view_shows_the_tissue_open_from_its_first_moment(made: Made, tmp_path: 
             page.wait(lambda: page.state().get('meshes') and page.state()['parts'], 'the tissue')
             state = page.state()
             assert state['mode'] == 'replay'
-            assert state['parts']['tissue']['lips'] >= made.before['parts']['tissue']['lips'] > 0
+            assert (
+                state['parts']['tissue']['cutEdges']
+                >= made.before['parts']['tissue']['cutEdges']
+                > 0
+            )
     finally:
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0, said.read_text()

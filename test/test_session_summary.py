@@ -141,7 +141,7 @@ def test_each_thing_that_went_wrong_is_one_sentence(
 
 
 def test_messages_sent_before_the_recorder_knew_the_topic_are_no_loss(good: Summary) -> None:
-    assert failures_of(good, unheard={'/arm/measured_cp': 40}) == []
+    assert failures_of(good, missed={'/arm/measured_cp': 40}) == []
 
 
 def test_script_without_a_cut_need_not_cut(good: Summary) -> None:
@@ -253,7 +253,7 @@ def test_evidence_is_what_was_written_into_the_bag(tmp_path: Path) -> None:
     assert evidence.forces[:, 1].tolist() == [5.0, 10.0, 25.0]
     assert evidence.duration == pytest.approx(0.4)
     assert evidence.lost == {'/tool/contact': 2, '/arm/servo_cf': 2}
-    assert evidence.unheard == {'/arm/servo_cf': 6}
+    assert evidence.missed == {'/arm/servo_cf': 6}
 
 
 def test_what_a_late_node_said_unheard_is_no_loss_of_the_others(tmp_path: Path) -> None:
@@ -264,4 +264,4 @@ def test_what_a_late_node_said_unheard_is_no_loss_of_the_others(tmp_path: Path) 
     writer.close()
     evidence = read_evidence(tmp_path / 'bag')
     assert evidence.lost == {}
-    assert evidence.unheard == {'/parameter_events': 6}
+    assert evidence.missed == {'/parameter_events': 6}

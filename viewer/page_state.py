@@ -48,7 +48,7 @@ class TissueFrame:
             for kind, at, faces in zip(KINDS, self.positions, self.faces, strict=True)
         ]
         header = {'type': 'mesh', 'name': self.name, 'revision': self.revision}
-        text = json.dumps(header | {'parts': parts, 'lips': len(self.cut_edges)}).encode()
+        text = json.dumps(header | {'parts': parts, 'cut_edges': len(self.cut_edges)}).encode()
         text += b' ' * (-len(text) % 4)
         pieces = [len(text).to_bytes(4, 'little'), text]
         for at, faces in zip(self.positions, self.faces, strict=True):

@@ -26,7 +26,7 @@ the one before:
 A tissue is binary. It begins with the length of a header as little-endian uint32, and the header
 as JSON, padded with spaces so that both have a multiple of 4 bytes. Each part follows with its
 positions, float32 (vertices, 3) [m], and, where `faces` is not null, its triangles, uint32
-(faces, 3). At the end are the edges of the cuts, float32 (lips, 3). Null triangles mean that the
+(faces, 3). At the end are the edges of the cuts, float32 (cut_edges, 3). Null triangles mean that the
 page has them already.
 """  # noqa: E501
 

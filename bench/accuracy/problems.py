@@ -345,10 +345,10 @@ class AfterCut:
         u = np.zeros_like(mesh.rest)
         u[far, 0] = self._stretch * self.solid.size[0]
         u = equilibrium(elastic, np.zeros_like(u), start=u)
-        lips = mesh.triangles[mesh.triangle_kind == CUT]
-        corners = mesh.rest[lips]
+        faces = mesh.triangles[mesh.triangle_kind == CUT]
+        corners = mesh.rest[faces]
         areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-        opening = -float(np.einsum('ij,ij->', u[lips].mean(axis=1), areas))
+        opening = -float(np.einsum('ij,ij->', u[faces].mean(axis=1), areas))
         force, width = (value.value for value in self.reference)
         pull = float(elastic.force(u)[far, 0].sum())
         return Rest(elastic, u, Errors(abs(opening / width - 1), abs(pull / force - 1)))

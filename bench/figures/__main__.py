@@ -35,7 +35,7 @@ SUBJECTS = {
             3: 'the law of the blade is not measured here',
             4: 'the force in the hand is not measured here',
             5: 'it needs a live session under load',
-            6: 'the lips are not measured here',
+            6: 'the cut faces are not measured here',
             7: 'it takes minutes: `./trainer validate`',
             8: 'the pieces are not measured here',
             9: 'it takes a quiet machine: `./trainer bench speed`',

@@ -57,9 +57,9 @@ def message(data: bytes, log_time: int = TIME_NS, channel: int = 1) -> bytes:
 
 def chunk(data: bytes, compression: str = 'zstd', **lies: Any) -> Chunk:
     pack = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress, '': bytes}[compression]
-    told = {'uncompressed_size': len(data), 'uncompressed_crc': zlib.crc32(data)}
+    sizes = {'uncompressed_size': len(data), 'uncompressed_crc': zlib.crc32(data)}
     span = {'message_start_time': TIME_NS, 'message_end_time': TIME_NS + 10**9}
-    return Chunk(**({'compression': compression, 'data': pack(data)} | span | told | lies))
+    return Chunk(**({'compression': compression, 'data': pack(data)} | span | sizes | lies))
 
 
 def bomb(size: int, compression: str, **lies: Any) -> Chunk:
@@ -71,11 +71,11 @@ def bomb(size: int, compression: str, **lies: Any) -> Chunk:
     else:
         data = (lines := lz4.frame.LZ4FrameCompressor()).begin(size)
         data += b''.join(lines.compress(piece) for _ in range(size >> 20)) + lines.flush()
-    told = {'uncompressed_size': size, 'uncompressed_crc': 0}
+    sizes = {'uncompressed_size': size, 'uncompressed_crc': 0}
     return Chunk(
         **(
             {'compression': compression, 'data': data, 'message_start_time': TIME_NS}
-            | {'message_end_time': TIME_NS + 10**9} | told | lies
+            | {'message_end_time': TIME_NS + 10**9} | sizes | lies
         )
     )  # fmt: skip
 

@@ -202,8 +202,8 @@ def _relay(impairment: Impairment, seed: int, namespaces: Sequence[str]) -> None
     print('up', flush=True)
     while True:
         now = time.monotonic()
-        patience = max(0.0, min(d.due for d in directions) - now)
-        ready, _, _ = select.select([a, b, sys.stdin], [], [], min(patience, 0.1))
+        wait_s = max(0.0, min(d.due for d in directions) - now)
+        ready, _, _ = select.select([a, b, sys.stdin], [], [], min(wait_s, 0.1))
         if sys.stdin in ready:
             line = sys.stdin.readline()
             if not line:

@@ -118,7 +118,7 @@ class OpenPage:
 
 
 def read_tissue(data: bytes) -> tuple[dict[str, Any], list[tuple[Any, Any]], np.ndarray]:
-    """Return header, positions and faces of each part, and lips of a binary message."""
+    """Return header, positions and faces of each part, and cut edges of a binary message."""
     at = 4 + int.from_bytes(data[:4], 'little')
     assert at % 4 == 0
     header = json.loads(data[4:at])
@@ -131,9 +131,9 @@ def read_tissue(data: bytes) -> tuple[dict[str, Any], list[tuple[Any, Any]], np.
             faces = np.frombuffer(data, '<u4', 3 * part['faces'], at).reshape(-1, 3)
             at += faces.nbytes
         parts.append((positions, faces))
-    lips = np.frombuffer(data, '<f4', 3 * header['lips'], at).reshape(-1, 3)
-    assert at + lips.nbytes == len(data)
-    return header, parts, lips
+    cut_edges = np.frombuffer(data, '<f4', 3 * header['cut_edges'], at).reshape(-1, 3)
+    assert at + cut_edges.nbytes == len(data)
+    return header, parts, cut_edges
 
 
 class OtherProcess:

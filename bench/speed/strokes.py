@@ -133,7 +133,7 @@ class Session:
         self._random = np.random.default_rng(seed)
         self._volume = float(self.simulation.mesh.volumes().sum())
         self._ways: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        self._lips = cut_faces(self.simulation.mesh)
+        self._cut_faces = cut_faces(self.simulation.mesh)
         self.strokes = self.substeps = 0
         self.troubles: list[str] = []
 
@@ -146,7 +146,7 @@ class Session:
         self.strokes += 1
         start, end, up = self._way()
         mesh = self.simulation.mesh
-        self._lips, self._method.folded = cut_faces(mesh), False
+        self._cut_faces, self._method.folded = cut_faces(mesh), False
         depth = self._random.uniform(0.006, 0.014)
         down = np.arange(0.0, depth, _BLADE_STEP)
         steps = max(int(np.ceil(np.linalg.norm(end - start) / _BLADE_STEP)), 1)
@@ -210,7 +210,7 @@ class Session:
             ViolationError: an invariant is violated; the message says where.
         """
         mesh = self.simulation.mesh
-        old = cut_faces(mesh) if self._method.folded else self._lips
+        old = cut_faces(mesh) if self._method.folded else self._cut_faces
         check_mesh(mesh, self._volume, old, tolerance=1e-9)
 
     @property

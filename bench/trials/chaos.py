@@ -142,9 +142,9 @@ def run_chaos(options: ChaosOptions) -> Status:
     scene = load_scene(options.scene)
     bag = new_bag(options.bag, f'chaos-{scene.name}')
 
-    def report(mischief: FaultInjector, outcome: Outcome) -> list[str]:
-        faults = sorted([*mischief.faults, *mischief.unfinished()], key=lambda fault: fault.began)
-        seen = mischief.operator.seen
+    def report(injector: FaultInjector, outcome: Outcome) -> list[str]:
+        faults = sorted([*injector.faults, *injector.unfinished()], key=lambda fault: fault.began)
+        seen = injector.operator.seen
         failures = [
             *force_failures(seen, faults, scene.device.load_profile()),
             *lost_cuts(seen),

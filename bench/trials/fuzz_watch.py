@@ -130,14 +130,14 @@ class NodeObserver:
         try:
             codec.believed(data)
         except MessageError as error:
-            self._tell(f'{topic}: {error}')
+            self._report(f'{topic}: {error}')
 
     def _check_numbers(self, topic: str, message: Any) -> None:
         for name, numbers in numbers_of(message):
             if not (np.abs(numbers) <= MAX_COORDINATE_M).all():  # a NaN is not
-                self._tell(f'{topic}: {name} has a number that is not finite or too far')
+                self._report(f'{topic}: {name} has a number that is not finite or too far')
 
-    def _tell(self, problem: str) -> None:
+    def _report(self, problem: str) -> None:
         if len(self.problems) < _MAX_PROBLEMS:
             self.problems.append(problem)
 

@@ -55,8 +55,8 @@ class Operator:
         script = scene.arm.require_script()
         points = [w.position for phase in script.phases for w in phase.waypoints]
         self._path = np.array([script.start.position, *points])
-        turned = script.start.rotation()
-        self._turn = quaternion(np.eye(3) if turned is None else turned)
+        rotation = script.start.rotation()
+        self._orientation = quaternion(np.eye(3) if rotation is None else rotation)
         self._random = np.random.default_rng(seed)
         self._began = time.monotonic()
         self._round, self._shift = -1, np.zeros(3)
@@ -81,7 +81,7 @@ class Operator:
         }
         self._reset = node.create_client(Trigger, f'{BRIDGE_NODE}/reset_e_stop')
         self._newest: dict[str, Any] = {}
-        self._told = node.create_publisher(String, FAULTS, ros.HISTORY)
+        self._faults = node.create_publisher(String, FAULTS, ros.HISTORY)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(node)
         self._stop = threading.Event()
@@ -95,7 +95,7 @@ class Operator:
 
     def log_fault(self, fault: str) -> None:
         """Publish a fault for the bag."""
-        self._told.publish(String(data=fault))
+        self._faults.publish(String(data=fault))
 
     def take_seen(self) -> Observations:
         """Return the observations since the last call; they take 24 MB a minute."""
@@ -173,5 +173,5 @@ class Operator:
         goal.header.frame_id, goal.header.stamp = ros.FRAME, ros.stamp(time.time_ns())
         p, q = goal.pose.position, goal.pose.orientation
         p.x, p.y, p.z = (float(x) for x in np.array(position) + self._shift)
-        q.x, q.y, q.z, q.w = (float(x) for x in self._turn)
+        q.x, q.y, q.z, q.w = (float(x) for x in self._orientation)
         return goal

@@ -114,7 +114,7 @@ def run_trial(
         commands, logs = nodes(Path(temporary)), bag or Path(temporary)
         course: C | None = None
 
-        def tell(event: Event) -> None:
+        def on_event(event: Event) -> None:
             if event.kind == 'ready' and course is not None:
                 course.ready(event.node)
             elif event.kind != 'warning' or bag is None:
@@ -123,7 +123,7 @@ def run_trial(
         with (
             SessionProgress(notes, len(commands)) as progress,
             Supervisor(
-                commands, logs / 'log', node_environment(domain), tell, restart=restart
+                commands, logs / 'log', node_environment(domain), on_event, restart=restart
             ) as supervisor,
         ):
             if not supervisor.start():

@@ -29,7 +29,7 @@ class DeviceConvention:
         self._unit = _METRES[settings.length_unit]
         self._mirror = _MIRRORS[settings.mirrored_axis]
         mirrored = settings.mirrored_axis != 'none'
-        self._turn = tuple(-sign if mirrored else 1.0 for sign in self._mirror)
+        self._torque_signs = tuple(-sign if mirrored else 1.0 for sign in self._mirror)
         self._sign = float(settings.force_sign)
         self._plain_pose = not mirrored and self._unit == 1.0
         self._plain_force = not mirrored and self._sign == 1.0
@@ -40,11 +40,11 @@ class DeviceConvention:
             return sample
         return sample._replace(values=self._moved(sample.values, self._unit))
 
-    def spoken_pose(self, values: tuple[float, ...]) -> tuple[float, ...]:
+    def to_device_pose(self, values: tuple[float, ...]) -> tuple[float, ...]:
         """Return the inverse: position [m] and quaternion as the device would send them."""
         return values if self._plain_pose else self._moved(values, 1 / self._unit)
 
-    def spoken_twist(self, values: tuple[float, ...]) -> tuple[float, ...]:
+    def to_device_twist(self, values: tuple[float, ...]) -> tuple[float, ...]:
         """Return linear [m/s] and angular velocity [rad/s] as the device would send them."""
         return values if self._plain_pose else self._moved(values, 1 / self._unit)
 
@@ -54,10 +54,12 @@ class DeviceConvention:
             return wrench
         # `+ 0.0` so that a zero force has no sign.
         linear = (self._sign * m * f + 0.0 for m, f in zip(self._mirror, wrench[:3], strict=True))
-        turned = (self._sign * t * m + 0.0 for t, m in zip(self._turn, wrench[3:], strict=True))
+        turned = (
+            self._sign * t * m + 0.0 for t, m in zip(self._torque_signs, wrench[3:], strict=True)
+        )
         return (*linear, *turned)
 
     def _moved(self, values: tuple[float, ...], unit: float) -> tuple[float, ...]:
         linear = (unit * m * x for m, x in zip(self._mirror, values[:3], strict=True))
-        turned = (t * w for t, w in zip(self._turn, values[3:6], strict=True))
+        turned = (t * w for t, w in zip(self._torque_signs, values[3:6], strict=True))
         return (*linear, *turned, *values[6:])

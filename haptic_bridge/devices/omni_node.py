@@ -30,7 +30,7 @@ from cutting_trainer.node_common.stamps import nanoseconds
 from cutting_trainer.node_common.timing import PeriodicLoop
 
 RATE_HZ = 1000.0
-_NO_TURN = (0.0, 0.0, 0.0)
+_ZERO = (0.0, 0.0, 0.0)
 
 
 class OmniAdapter(ManagedNode):
@@ -97,7 +97,7 @@ class OmniAdapter(ManagedNode):
 
     def rest(self) -> None:
         """Set the force to zero."""
-        self._push(_NO_TURN)
+        self._push(_ZERO)
 
     def _tick(self, _late: int) -> None:
         if (state := take(self._state)) is not None:
@@ -107,7 +107,7 @@ class OmniAdapter(ManagedNode):
             try:
                 stamp, _, values = self._wrench.decode(raw)
             except WireError as error:
-                stamp, values = 0, _NO_TURN
+                stamp, values = 0, _ZERO
                 self.get_logger().error(str(error), throttle_duration_sec=1.0)
             self._latch.take(stamp, values[:3], now)
         self._push(self._latch.force(now))
@@ -116,7 +116,7 @@ class OmniAdapter(ManagedNode):
         valid = nanoseconds(state.header.stamp)
         p, q, v = state.pose.position, state.pose.orientation, state.velocity
         pose = (*self._convention.metres((p.x, p.y, p.z)), q.x, q.y, q.z, q.w)
-        twist = (*self._convention.metres((v.x, v.y, v.z)), *_NO_TURN)
+        twist = (*self._convention.metres((v.x, v.y, v.z)), *_ZERO)
         self._measured_cp.publish(self._codecs[0].encode(valid, pose))
         self._measured_cv.publish(self._codecs[1].encode(valid, twist))
 

@@ -256,8 +256,8 @@ def _handedness(moves: Sequence[np.ndarray], topic: str) -> ProbeCheck:
             'handedness', 'unknown', measured, 'the three moves were not at right angles: repeat'
         )
     if volume > 0:
-        turn = Rotation.align_vectors(np.eye(3), directions.T)[0].as_euler('xyz', degrees=True)
-        rpy = ', '.join(f'{angle:.0f}' for angle in np.round(turn) + 0.0)
+        rotation = Rotation.align_vectors(np.eye(3), directions.T)[0].as_euler('xyz', degrees=True)
+        rpy = ', '.join(f'{angle:.0f}' for angle in np.round(rotation) + 0.0)
         return ProbeCheck('handedness', 'ok', f'{measured}; turned by rpy {rpy} deg')
     return ProbeCheck(
         'handedness',

@@ -53,7 +53,7 @@ def check_push(
         )
         return [ProbeCheck('force', 'unknown', measured, why)]
     left, _, right = np.linalg.svd(response)
-    turn = left @ right
+    rotation = left @ right
     doubt = direction_uncertainty(forces, yields)
     if doubt > MAX_UNCERTAINTY_DEG:
         why = (
@@ -61,8 +61,8 @@ def check_push(
             f'{doubt:.0f} degrees only; hold the arm loosely and still, and push again'
         )
         return [ProbeCheck('force', 'unknown', measured, why)]
-    angle = _degrees(turn if np.linalg.det(turn) > 0 else -turn)
-    sentence = _wrong(turn, angle, tool, topic)
+    angle = _degrees(rotation if np.linalg.det(rotation) > 0 else -rotation)
+    sentence = _wrong(rotation, angle, tool, topic)
     turned = f'turned by {angle:.0f} deg (+-{doubt:.0f})'
     verdict = ProbeCheck('force', 'wrong' if sentence else 'ok', f'{measured}; {turned}', sentence)
     return [verdict]
@@ -90,12 +90,12 @@ def _degrees(rotation: np.ndarray) -> float:
     return math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))))
 
 
-def _wrong(turn: np.ndarray, angle: float, tool: np.ndarray | None, topic: str) -> str:
-    """Return the fault of a force rotated by `turn`, shape (3, 3); '' where there is none."""
+def _wrong(rotation: np.ndarray, angle: float, tool: np.ndarray | None, topic: str) -> str:
+    """Return the fault of a force rotated by `rotation`, shape (3, 3); '' where there is none."""
     other_way = f'the force on {topic} acts the other way round, towards the tissue'
-    mirrored = np.linalg.det(turn) < 0
-    signs = np.sign(np.diag(turn))
-    along_axes = (np.abs(np.diag(turn)) > math.cos(math.radians(MAX_ROTATION_DEG))).all()
+    mirrored = np.linalg.det(rotation) < 0
+    signs = np.sign(np.diag(rotation))
+    along_axes = (np.abs(np.diag(rotation)) > math.cos(math.radians(MAX_ROTATION_DEG))).all()
     if along_axes and (signs > 0).all():
         return ''
     if along_axes and (signs < 0).all():
@@ -104,13 +104,13 @@ def _wrong(turn: np.ndarray, angle: float, tool: np.ndarray | None, topic: str) 
         axes = ', '.join(axis for axis, sign in zip('xyz', signs, strict=True) if sign < 0)
         return f'{other_way}: only along {axes}, as in a frame that is mirrored for the force alone'
     for sense, text in ((tool, 'in the axes of the tool'), (_inverse(tool), 'turned back by it')):
-        if sense is not None and not mirrored and _degrees(turn @ sense.T) < MAX_ROTATION_DEG:
+        if sense is not None and not mirrored and _degrees(rotation @ sense.T) < MAX_ROTATION_DEG:
             return (
                 f'the force on {topic} rotates with the tool ({text}), by {angle:.0f} degrees as '
                 'it stands: set device.force_frame: body, or have the driver take base axes'
             )
-    column = int(np.argmax(angle_of_axes := 1 - np.abs(np.diag(turn))))
-    moved = int(np.argmax(np.abs(turn[:, column])))
+    column = int(np.argmax(angle_of_axes := 1 - np.abs(np.diag(rotation))))
+    moved = int(np.argmax(np.abs(rotation[:, column])))
     if moved != column and angle_of_axes[column] > _OFF:
         axes = f'a push along {"xyz"[column]} moved the tip along {"xyz"[moved]}'
     else:

@@ -75,7 +75,7 @@ def check_rotation(
         turns = [
             from_quaternion((*(sense * q[list(places[:3])]), q[places[3]])) for q in (before, after)
         ]
-        angle, axis = _turn(turns[1] @ turns[0].T)
+        angle, axis = _angle_and_axis(turns[1] @ turns[0].T)
         found[order] = angle, math.degrees(math.acos(np.clip(axis @ wanted, -1.0, 1.0)))
     fitting = {
         order: off
@@ -122,7 +122,7 @@ def find_rotation(times: np.ndarray, quaternions: np.ndarray) -> np.ndarray | No
     return np.asarray(last[-1])
 
 
-def _turn(rotation: np.ndarray) -> tuple[float, np.ndarray]:
+def _angle_and_axis(rotation: np.ndarray) -> tuple[float, np.ndarray]:
     """Return angle [deg] and axis of a rotation, shape (3, 3)."""
     vector = np.array(
         [

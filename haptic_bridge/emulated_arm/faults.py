@@ -55,8 +55,8 @@ class DriverFaults:
     def pose(self, values: tuple[float, ...]) -> tuple[float, ...]:
         """Return a pose as it is sent: position and quaternion."""
         position = tuple(self.scale * x for x in values[:3])
-        turn = (values[6], *values[3:6]) if self.w_first else values[3:]
-        return (*position, *turn)
+        orientation = (values[6], *values[3:6]) if self.w_first else values[3:]
+        return (*position, *orientation)
 
     def frame(self, frame_id: str, seconds: float) -> str:
         """Return the frame_id that is sent at a time [s] after the start."""

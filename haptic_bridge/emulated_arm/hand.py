@@ -173,8 +173,8 @@ class EmulatedHand:
         """
         if self._goal is None:
             self._held = self.position.copy(), self.velocity.copy()
-        turn = orientation / np.linalg.norm(orientation)
-        self._goal = np.array(position, float), turn if turn @ self.orientation >= 0 else -turn
+        unit = orientation / np.linalg.norm(orientation)
+        self._goal = np.array(position, float), unit if unit @ self.orientation >= 0 else -unit
 
     def move_to(self, time: float, tremor_time: float) -> None:
         """Set the target to that of a time.

@@ -221,8 +221,8 @@ class ArmNode(ManagedNode):
 
     def _publish(self, stamp: int) -> None:
         arm, spoken = self._arm, self._convention
-        pose = spoken.spoken_pose((*arm.position.tolist(), *arm.orientation.tolist()))
-        twist = spoken.spoken_twist((*arm.velocity.tolist(), *arm.angular_velocity.tolist()))
+        pose = spoken.to_device_pose((*arm.position.tolist(), *arm.orientation.tolist()))
+        twist = spoken.to_device_twist((*arm.velocity.tolist(), *arm.angular_velocity.tolist()))
         wrench = spoken.force((*arm.force.tolist(), *_NO_TORQUE))
         frame = self._faults.frame(self._frame_id, time.monotonic() - self._started)
         if frame != self._frame_id:
@@ -237,14 +237,14 @@ class ArmNode(ManagedNode):
         try:
             goal = self._cp.believed(data)
             require_frame(HAND, goal.frame_id)
-            position, turn = np.array(goal.values[:3]), np.array(goal.values[3:])
+            position, orientation = np.array(goal.values[:3]), np.array(goal.values[3:])
             if np.linalg.norm(position) > _MAX_GOAL_DISTANCE_M:
                 text = f'{position} m is farther than {_MAX_GOAL_DISTANCE_M:g} m'
                 raise MessageError('not finite or too far', text)
         except MessageError as error:
             self.rejections.add(HAND, error)
             return
-        turned = self._frame.rotation().T @ from_quaternion(turn)
+        turned = self._frame.rotation().T @ from_quaternion(orientation)
         self._arm.guide(self._frame.to_device(position), quaternion(turned))
 
     def _bridge_state(self, message: Any) -> None:

@@ -37,13 +37,13 @@ def _children(
         for i in range(4)
     ]
     # Opposite edges of a tetrahedron: 0-5, 1-4, 2-3; the others make a ring around a diagonal.
-    rings = {(0, 5): (1, 3, 4, 2), (1, 4): (0, 3, 5, 2), (2, 3): (0, 1, 5, 4)}
+    cycles = {(0, 5): (1, 3, 4, 2), (1, 4): (0, 3, 5, 2), (2, 3): (0, 1, 5, 4)}
     diagonals = np.stack(
-        [np.linalg.norm(rest[middle[:, a]] - rest[middle[:, b]], axis=1) for a, b in rings], axis=1
+        [np.linalg.norm(rest[middle[:, a]] - rest[middle[:, b]], axis=1) for a, b in cycles], axis=1
     )
     shortest = diagonals.argmin(axis=1)
     inner = []
-    for which, ((a, b), ring) in enumerate(rings.items()):
+    for which, ((a, b), ring) in enumerate(cycles.items()):
         at = middle[shortest == which]
         for i in range(4):
             inner.append(at[:, [a, b, ring[i], ring[(i + 1) % 4]]])

@@ -2,7 +2,7 @@
 
 const KINDS = ['outer', 'cut'];
 
-/** @returns {{name, revision, parts: Object<string, {positions, faces}>, lips: Float32Array}} */
+/** @returns {{name, revision, parts: Object<string, {positions, faces}>, cutEdges: Float32Array}} */
 export function decodeMesh(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   if (length > buffer.byteLength - 4) throw new RangeError('the header is longer than the message');
@@ -23,6 +23,6 @@ export function decodeMesh(buffer) {
     const faces = part.faces === null ? null : take(Uint32Array, 3 * part.faces);
     parts[part.kind] = { positions, faces };
   }
-  const lips = take(Float32Array, 3 * (header.lips ?? 0));
-  return { name: header.name, revision: header.revision, parts, lips };
+  const cutEdges = take(Float32Array, 3 * (header.cut_edges ?? 0));
+  return { name: header.name, revision: header.revision, parts, cutEdges };
 }

@@ -53,7 +53,7 @@ export class TissueView {
   update(mesh) {
     this.revision = mesh.revision;
     for (const [kind, part] of Object.entries(mesh.parts)) this._part(kind, part);
-    this._showCutEdges(mesh.lips);
+    this._showCutEdges(mesh.cutEdges);
     if (this.first === null && mesh.parts.outer?.positions.length > 0) {
       this.first = new Box3().setFromArray(mesh.parts.outer.positions);
     }
@@ -66,7 +66,7 @@ export class TissueView {
       (mesh.geometry.index?.count ?? 0) / 3,
     ];
     return {
-      outer: count(this.parts.outer), cut: count(this.parts.cut), lips: this._lipPoints ?? 0,
+      outer: count(this.parts.outer), cut: count(this.parts.cut), cutEdges: this._cutEdgePoints ?? 0,
     };
   }
 
@@ -101,7 +101,7 @@ export class TissueView {
 
   _showCutEdges(points) {
     const count = Math.floor(points.length / 6);
-    this._lipPoints = points.length / 3;
+    this._cutEdgePoints = points.length / 3;
     this.cutEdges.visible = count > 0;
     if (count === 0) return;
     const { geometry } = this.cutEdges;
