@@ -107,16 +107,15 @@ def running(
     command: Sequence[str], environment: Mapping[str, str], ready: str = ''
 ) -> Iterator['subprocess.Popen[str]']:
     """Runs a program, of which one of the first lines is `ready`; kills it at the end."""
-    process = subprocess.Popen(
+    with subprocess.Popen(
         command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert process.stdout is not None
-        assert not ready or f'{ready}\n' in process.stdout
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert not ready or f'{ready}\n' in process.stdout
+            yield process
+        finally:
+            process.kill()
 
 
 def node_words(module: str, *arguments: str) -> list[str]:
