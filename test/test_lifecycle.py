@@ -14,14 +14,14 @@ import rclpy
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from live import ROOT, free_domain, two_presses, wait_for, write_scene
+from live import PATIENCE, ROOT, free_domain, two_presses, wait_for, write_scene
 from rclpy.node import Node
 
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
 from cutting_trainer.node_common.ros import NEWEST_BEST_EFFORT, polled, take_raw
 from cutting_trainer.session.graph import MODULES, node_environment
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.long
 
 
 class Manager:
@@ -50,7 +50,7 @@ class Manager:
 
     def _ask(self, client: Any, request: Any) -> Any:
         future = client.call_async(request)
-        self._executor.spin_until_future_complete(future, 60.0)
+        self._executor.spin_until_future_complete(future, PATIENCE)
         return future.result()
 
     def change(self, transition: int) -> str:
@@ -107,7 +107,7 @@ def test_node_goes_through_its_life_and_a_second_one(managers: Any, name: str) -
     node.change(Transition.TRANSITION_ACTIVATE)
     request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVE_SHUTDOWN))
     node._change.call_async(request)
-    assert node.process.wait(30) == 0
+    assert node.process.wait(PATIENCE) == 0
 
 
 def test_node_with_a_bad_scene_stays_unconfigured_says_why_and_lives(

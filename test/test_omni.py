@@ -11,8 +11,6 @@ from live import node_words, running
 from cutting_trainer.haptic_bridge.devices.omni import ForceLatch, OmniConvention
 from cutting_trainer.session.graph import node_environment
 
-pytestmark = pytest.mark.real_time
-
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = 90
 MILLISECOND = 1_000_000
@@ -44,6 +42,7 @@ def test_a_force_is_held_for_30_ms_and_no_longer():
         assert latch.force(43 * MILLISECOND) == (0, 0, 0)
 
 
+@pytest.mark.real_time
 @pytest.mark.thorough
 def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
     ours = node_environment(DOMAIN)

@@ -54,8 +54,6 @@ from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
-pytestmark = pytest.mark.real_time
-
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 SUBSCRIBERS = {
@@ -88,6 +86,13 @@ def test_a_loop_begins_again_where_the_replay_began() -> None:
     head.move(0.0)
     assert head.move(2.5) == 2.0
     assert head.rounds == 1 and not head.over
+
+
+def test_a_jump_ends_within_the_part_that_is_replayed() -> None:
+    head = Playhead(2.0, 4.0)
+    for asked, reached in ((0.0, 2.0), (3.0, 3.0), (9.0, 4.0)):
+        head.seek(asked)
+        assert head.position == reached
 
 
 def test_keys_pause_step_and_end() -> None:
@@ -232,6 +237,7 @@ def hand_player(context: rclpy.Context, playhead: Playhead, bag: Bag) -> HandPla
     return player
 
 
+@pytest.mark.real_time
 def test_the_hand_goes_once_the_bridge_is_enabled_and_presses_its_button_again(
     context: rclpy.Context, pressed: Bag
 ) -> None:
@@ -267,6 +273,7 @@ def test_the_hand_goes_once_the_bridge_is_enabled_and_presses_its_button_again(
         node.destroy_node()
 
 
+@pytest.mark.real_time
 def test_a_bridge_that_was_enabled_too_shortly_to_be_heard_ends_the_replay(
     context: rclpy.Context,
 ) -> None:
@@ -299,6 +306,7 @@ def test_a_bridge_that_says_nothing_is_not_waited_for_for_ever(context: rclpy.Co
         player.stop()
 
 
+@pytest.mark.real_time
 def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
     context: rclpy.Context,
 ) -> None:
@@ -393,6 +401,7 @@ class Terminal:
         return termios.tcgetattr(self._theirs) == self._settings
 
 
+@pytest.mark.real_time
 def test_keys_of_a_terminal_pause_a_replay_step_it_and_end_it() -> None:
     options = ('--as-recorded', '--loop', '--start', '2', '--rate', '0.5', '--domain', 'free')
     terminal = Terminal('replay', str(SAMPLE), *options)
@@ -415,6 +424,7 @@ def test_keys_of_a_terminal_pause_a_replay_step_it_and_end_it() -> None:
         terminal.process.wait()
 
 
+@pytest.mark.real_time
 @pytest.mark.thorough
 def test_the_recorded_hand_cuts_the_tissue_again(tmp_path: Path) -> None:
     command = [

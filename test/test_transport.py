@@ -16,7 +16,7 @@ from live import PATIENCE, ROOT, free_domain, running
 from cutting_trainer.session.graph import PROFILES, RANGE, discovery, node_environment
 from cutting_trainer.session.network import Network, network_environment
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.long
 
 DDS = '{http://www.eprosima.com}'
 FREEZES, SENT = 40, 20
