@@ -26,7 +26,7 @@ from cutting_trainer.session.graph import node_environment
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, delta_from, mesh_message
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[1]
 SCENE = 'cutting: {method: combined}\n'

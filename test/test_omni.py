@@ -71,6 +71,7 @@ def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
     assert seen['buttons'] == [[1, 0]]
 
 
+@pytest.mark.long
 def test_without_omni_msgs_the_adapter_says_what_to_do(tmp_path):
     pytest.importorskip('rclpy')
     done = subprocess.run(

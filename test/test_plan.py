@@ -21,7 +21,7 @@ from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost, ErrorE
 from cutting_trainer.tissue_sim.planner.frame_cost import frame_cost, with_regions
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.long
 
 GEL = Material(5000.0, 0.4, 1000.0, 10.0, 2e-4)
 

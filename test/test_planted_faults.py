@@ -12,6 +12,8 @@ from bench.faults.candidates import KINDS, Fault, draw
 from bench.faults.copy import Outcome, read_outcome
 from bench.faults.suspects import likely_tests
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[1]
 COUNT = 40
 

@@ -221,6 +221,7 @@ def context() -> Iterator[rclpy.Context]:
         rclpy.shutdown(context=context)
 
 
+@pytest.mark.long
 def test_a_recorded_force_is_played_to_a_device_only_when_told_to(context: rclpy.Context) -> None:
     for drive in (False, True):
         player = SessionPlayer(
@@ -294,6 +295,7 @@ def test_a_bridge_that_was_enabled_too_shortly_to_be_heard_ends_the_replay(
         node.destroy_node()
 
 
+@pytest.mark.long
 def test_a_bridge_that_says_nothing_is_not_waited_for_for_ever(context: rclpy.Context) -> None:
     player = hand_player(context, Playhead(0.0, 5.0), open_bag(SAMPLE))
     try:
@@ -347,6 +349,7 @@ def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
         node.destroy_node()
 
 
+@pytest.mark.long
 def test_a_replay_into_a_live_graph_is_refused_in_one_line(context: rclpy.Context) -> None:
     node = rclpy.create_node('live_arm', context=context)
     node.create_publisher(ForceSample, FORCE, ros.STREAM)

@@ -16,6 +16,8 @@ import pytest
 from cutting_trainer.session.node_process import CUT_OFF, NodeCommand
 from cutting_trainer.session.supervisor import Event, Supervisor
 
+pytestmark = pytest.mark.long
+
 FAKE = Path(__file__).with_name('fake_node.py')
 ROOT = FAKE.parents[1]
 ENVIRONMENT = os.environ | {'PYTHONUNBUFFERED': '1'}

@@ -20,7 +20,7 @@ from cutting_trainer.session.graph import node_environment
 from cutting_trainer.session.scene import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[1]
 

@@ -113,7 +113,7 @@ def find_rotation(times: np.ndarray, quaternions: np.ndarray) -> np.ndarray | No
     Returns:
         The quaternion, shape (4,); None as long as there was no rotation.
     """
-    if len(times) < 3 or times[-1] - times[0] < _REST:
+    if len(times) < 3:
         return None
     last = quaternions[times >= times[-1] - _REST]
     same = abs(float(quaternions[0] @ last[-1]))
