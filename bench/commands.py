@@ -275,7 +275,7 @@ def faults(
         typer.Option(help='Last round: 4 or 16 test files; all of `trainer test`; of `--all`.'),
     ] = 'usual',
     folder: Annotated[
-        Path, typer.Option(help='Keeps state and copy: an interrupted run goes on.')
+        Path, typer.Option(help='Keeps state and copy of the commit: an interrupted run goes on.')
     ] = Path('.trainer/faults'),
     seed: Seed = 0,
 ) -> None:

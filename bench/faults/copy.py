@@ -40,24 +40,25 @@ class Outcome:
 
 
 class Copy:
-    """A clone of a checkout's last commit.
+    """A clone of the commit that a checkout had when the run began.
 
     Args:
         checkout: whose environment and compiled kernels are used.
-        folder: for the clone and the caches; a clone that is there is brought to the commit.
+        folder: for the clone and the caches; those that are there are used as they are.
     """
 
     def __init__(self, checkout: Path, folder: Path) -> None:
         self.root = folder / 'copy'
         self._caches = folder / 'numba'
         self._checkout = checkout
-        commit = _git(checkout, 'rev-parse', 'HEAD')
-        if not self.root.is_dir():
+        ready = self._caches / 'ready'
+        if not ready.exists():
+            for part in (self.root, self._caches):
+                shutil.rmtree(part, ignore_errors=True)
             _git(checkout, 'clone', '--quiet', '--shared', str(checkout), str(self.root))
-        _git(self.root, 'fetch', '--quiet', str(checkout), 'HEAD')
-        _git(self.root, 'checkout', '--quiet', '--force', commit)
-        shutil.rmtree(self._caches, ignore_errors=True)
-        self._share_cache()
+            self._share_cache()
+            ready.touch()
+        _git(self.root, 'checkout', '--quiet', '--force', '.')  # a killed run leaves its fault
 
     def _share_cache(self) -> None:
         """Give the sources the times of the checkout's, and its kernels to their folders' names."""
