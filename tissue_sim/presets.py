@@ -69,6 +69,11 @@ _OTHER_LIVER = {
     'poissons_ratio': _NU,
     'density': Number(1060.0, 'borrowed', f'human liver: {_ACOUSTIC}'),
 }
+_HARDENS = (
+    'from E and the ultimate stress of 0.27 MPa at a true strain of 0.38, taken as true stress of '
+    f'an incompressible bar: {_ACOUSTIC}'
+)
+_STIFFENS = Number(9.2, 'borrowed', f'human liver, {_HARDENS}')
 _BLADE = f'middle of 187 to 225 J/m^2, porcine liver, blade: {_REVIEW}'
 _TIME = ('prony', 'friction')
 _LARGE = ('stiffening', *_TIME)
@@ -93,26 +98,28 @@ PRESETS: dict[PresetName, Preset] = {
     'liver_human': Preset(
         {
             **_HUMAN_LIVER,
-            'stiffening': Number(
-                9.2,
-                'computed',
-                'from E and the ultimate stress of 0.27 MPa at a true strain of 0.38, taken as '
-                f'true stress of an incompressible bar: {_ACOUSTIC}',
-            ),
+            'stiffening': Number(9.2, 'computed', _HARDENS),
+            'toughness': Number(206.0, 'borrowed', _BLADE),
         },
-        ('toughness', *_TIME),
+        _TIME,
     ),
     'liver_porcine': Preset(
-        {**_OTHER_LIVER, 'toughness': Number(206.0, 'computed', _BLADE)}, _LARGE
+        {
+            **_OTHER_LIVER,
+            'stiffening': _STIFFENS,
+            'toughness': Number(206.0, 'computed', _BLADE),
+        },
+        _TIME,
     ),
     'liver_bovine': Preset(
         {
             **_OTHER_LIVER,
+            'stiffening': _STIFFENS,
             'toughness': Number(
                 164.0, 'abstract', '164 +- 6 J/m^2, needle: doi 10.1016/j.medengphy.2011.09.030'
             ),
         },
-        _LARGE,
+        _TIME,
     ),
     'kidney_human': Preset(
         {

@@ -29,7 +29,7 @@ def draw(results: Mapping[str, Sequence[Result]]) -> Figure:
     """Return the picture: a labelled curve for each case, other models as points.
 
     Args:
-        results: by case.
+        results: by case; the first eight are drawn.
     """
     figure = Figure(figsize=(9.0, 6.0), layout='constrained')
     axes = figure.subplots()
