@@ -32,9 +32,9 @@ def run_plan(scene: str, *, as_json: bool = False) -> Status:
         SessionError, SceneError, MeshError: the scene cannot be used.
     """
     settings = load_scene(scene).tissue
-    with Console(stderr=True).status('measuring costs and errors', refresh_per_second=1):
+    with Console(stderr=True).status('loading kernels', refresh_per_second=1) as shown:
         warm_up()  # a kernel that is loaded meanwhile would count as cost
-        found = plan(make_task(settings))
+        found = plan(make_task(settings), shown.update)
     console = Console(soft_wrap=True, highlight=False)
     if as_json:
         console.out(json.dumps(as_data(scene, settings, found), indent=2), highlight=False)
@@ -74,7 +74,7 @@ def _chosen(chosen: Candidate, found: Plan) -> list[str]:
         'by the step': errors.time,
         'by nodes that are held': errors.region,
     }
-    said = [f'{percent(value)} {cause}' for cause, value in causes.items() if value >= 5e-4]
+    said = [f'{percent(value)} {cause}' for cause, value in causes.items() if value > 0.0]
     lines = [
         f'taken: {chosen.name}',
         f'  error {percent(errors.total)}: {", ".join(said)}',

@@ -4,7 +4,7 @@ Errors come from trial loads on the scene's own mesh (`probe`), costs from a few
 method on this machine.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 from cutting_trainer.tissue_sim.elasticity.models import PLANNED_MODELS, ModelName
@@ -99,28 +99,31 @@ class Plan:
         )
 
 
-def plan(task: Task) -> Plan:
+def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
     """Choose the simplest accurate model, and its cheapest integrator within the allowed cost.
 
     Args:
         task: the scene.
+        say: gets what is measured next.
 
     Raises:
         MeshError: the mesh cannot be probed.
     """
     b = task.budget
     count = len(task.mesh.tetrahedra)
+    say('errors by elements, by trial loads')
     probing = probe(task.mesh, task.material, b.contact_radius, b.displacement)
     rejected: list[Rejection] = []
     tried: list[Candidate] = []
     for model in PLANNED_MODELS:
         errors = errors_at_rest(model, probing, b)
         if errors.total <= b.error:  # deep indentation takes seconds to compute
+            say(f'error of {model} by large deformation')
             errors = model_errors(model, probing, b)
         if errors.total > b.error:
             rejected.append(inaccurate(model, errors, b))
             continue
-        found = sorted(_candidates(task, model, errors, probing), key=lambda c: c.cost.frame)
+        found = sorted(_candidates(task, model, errors, probing, say), key=lambda c: c.cost.frame)
         rejected += [unfit(task, c) for c in found if not task.fits(c)]
         tried += found
         fitting = [c for c in found if task.fits(c)]
@@ -134,11 +137,16 @@ def plan(task: Task) -> Plan:
 
 
 def _candidates(
-    task: Task, model: ModelName, errors: ErrorEstimate, probing: Probing
+    task: Task,
+    model: ModelName,
+    errors: ErrorEstimate,
+    probing: Probing,
+    say: Callable[[str], None],
 ) -> Iterator[Candidate]:
     for integrator in INTEGRATORS:
         if integrator == 'euler' and task.material.alpha == task.material.beta == 0.0:
             continue
+        say(f'cost of {model} by {integrator}')
         cost = frame_cost(task, model, integrator)
         wrong = time_error(integrator, task.material, probing.frequency, cost.step)
         yield Candidate(model, integrator, replace(errors, time=wrong), cost)

@@ -34,11 +34,10 @@ def inaccurate(model: ModelName, errors: ErrorEstimate, budget: Budget) -> Rejec
         f'at the {1e3 * budget.displacement:g} mm that this scene allows': errors.strain,
         'by elements of this size': errors.elements,
     }
-    largest = max(causes.values())
     said = [
         f'{percent(value)} {cause}' if math.isfinite(value) else f'gives way {cause}'
         for cause, value in causes.items()
-        if value > 0.01 and (value == largest or value > budget.error / 3)
+        if value > 0.0  # it has this cause, and it was computed
     ]
     return Rejection(model, f'{", ".join(said)}; {percent(budget.error)} is allowed')
 
