@@ -64,6 +64,12 @@ class QuadraticTissue:
         load = self.load(press)[self._free]
         return float(load @ self._factors.solve(load))
 
+    def corners(self, press: Indenter) -> Floats:
+        """Return the displacement of the mesh's nodes under 1 N [m], shape (n, 3)."""
+        u = np.zeros(len(self._free))
+        u[self._free] = self._factors.solve(self.load(press)[self._free])
+        return np.asarray(u[self._basis.nodal_dofs].T)
+
     def force(self, press: Indenter, depth: float, steps: int = 8) -> float:
         """Return the force that presses the neo-Hookean tissue to a depth [N].
 
