@@ -39,7 +39,8 @@ _PAGE = """# Speed against accuracy
 Written by `./trainer chart`: every elastic model with every integrator, on problems whose solution
 is known by other means. To the right is slower, upwards is worse; the grey line joins the points
 that no other beats in both. A curve is a model with the integrator that is cheapest on its finest
-mesh, dashed the error of its force; the other integrators are faint. Below each picture stands the cost of an error of 10 % and of 1 %.
+mesh, dashed the error of its force; the other integrators are faint. Below each picture stands the
+cost of an error of 10 % and of 1 %.
 All digits, both errors and the step: [points.csv](charts/points.csv).
 
 - **CPU time** is that of one thread for one second of simulated time at {safety:g} of the stable
