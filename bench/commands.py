@@ -200,10 +200,21 @@ def fuzz_cuts(
         Path, typer.Option(help='Folder for scenes that break an invariant.')
     ] = Path(),
     replay: Annotated[Path | None, typer.Option(help='Cut a saved scene again instead.')] = None,
+    yanks: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help='Load, cut and yank so many moving sliver meshes instead, 500 frames each; those '
+            'in yanks.jsonl of the folder are done.',
+        ),
+    ] = 0,
 ) -> None:
     """Cut random meshes by random strokes and check every invariant after every batch."""
     from bench.cuts.fuzz_cuts import replay_scene, run_strokes
+    from bench.cuts.yanks import run_yanks
 
+    if yanks:
+        raise typer.Exit(int(run_yanks(yanks, seed, output / 'yanks.jsonl')))
     options = (strokes, seed, method, output)
     raise typer.Exit(int(replay_scene(replay, method) if replay else run_strokes(*options)))
 

@@ -5,6 +5,7 @@ import pytest
 from meshes import irregular_box
 
 from bench.haptics.pages import run_accuracy, run_stability
+from bench.speed.script import run_script
 from bench.speed.strokes import Session
 from cutting_trainer.cutting.combined import CombinedMethod
 from cutting_trainer.cutting.method import SweepError
@@ -101,3 +102,11 @@ def test_a_sweep_that_is_refused_stays_uncut_as_in_the_graph(monkeypatch):
 def test_a_folder_that_cannot_take_the_tables_is_refused_before_anything_runs(command, tmp_path):
     with pytest.raises(SessionError, match='nowhere'):
         command(tmp_path / 'nowhere')
+
+
+def test_the_script_of_the_demo_opens_its_planned_lines_without_trouble() -> None:
+    """The tissue goes along by 12 to 18 mm before it is cut: the hand goes on after the lines."""
+    frames, _ = run_script('liver', {})
+    assert len(frames.opened) == 2
+    assert min(frames.opened) >= 0.95
+    assert not any(frames.trouble)

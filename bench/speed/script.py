@@ -42,6 +42,7 @@ class Frames:
         slow: simulated time over frame time.
         trouble: warnings.
         active: points where the law counts, heavier nodes, their mass over the whole.
+        opened: share of each planned line that the whole script opens.
     """
 
     phase: list[str] = field(default_factory=list)
@@ -53,6 +54,7 @@ class Frames:
     slow: list[float] = field(default_factory=list)
     trouble: list[str] = field(default_factory=list)
     active: list[tuple[float, ...]] = field(default_factory=list)
+    opened: list[float] = field(default_factory=list)
 
 
 class _Timed(Tissue):
@@ -124,9 +126,11 @@ def run_script(name: str, changes: dict[str, str]) -> tuple[Frames, list[str]]:
         ).sum()
     )
     said = [f'cut {simulation.elements_cut} elements, incision {1e4 * area:.2f} cm^2']
-    for number, path in enumerate(planned_paths(settings), 1):
-        said.append(f'line {number}: {_opened(corners, path):.0%} of its length is opened')
-    return tissue.frames, said
+    frames = tissue.frames
+    frames.opened = [_opened(corners, path) for path in planned_paths(settings)]
+    for number, share in enumerate(frames.opened, 1):
+        said.append(f'line {number}: {share:.0%} of its length is opened')
+    return frames, said
 
 
 def _opened(corners: np.ndarray, path: np.ndarray) -> float:
