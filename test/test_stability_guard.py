@@ -268,4 +268,5 @@ def test_a_loose_piece_that_is_pushed_away_stops_and_the_rest_goes_on(
     assert len(said) == 1 and 'a piece that nothing held' in said[0]
     assert 0.5 * size < dynamics.displacement[free].max() < size
     assert not dynamics.velocity[free].any()
+    assert not np.ptp(dynamics.displacement[free], axis=0).any()  # it has its shape at rest
     assert count == 40 * motion.substeps

@@ -9,6 +9,7 @@ from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.adjacency import spans_of
+from cutting_trainer.tissue_sim.mesh.checks import EDGES, components
 from cutting_trainer.tissue_sim.mesh.strain import Strain
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import (
     TetMesh,
@@ -292,10 +293,10 @@ class Dynamics:
         return FrameMotion(np.zeros_like(force), 0.0, 0.0, substeps, 0.0, trouble, diverged=True)
 
     def _hold_lost(self, u: np.ndarray, v: np.ndarray) -> bool:
-        """Return to the start of the frame, with lost pieces held.
+        """Return to the start of the frame, with lost pieces held in their shapes at rest.
 
         Args:
-            u, v: displacement [m] and velocity [m/s] at the start; v is changed.
+            u, v: displacement [m] and velocity [m/s] at the start; changed at these pieces.
 
         Returns:
             Whether there were any.
@@ -304,9 +305,14 @@ class Dynamics:
         lost = self._detector.lost(u[: 3 * n].reshape(-1, 3), self.displacement)
         if len(lost) == 0:
             return False
+        shape = u[: 3 * n].reshape(-1, 3)
+        piece = components(n, self.mesh.tetrahedra[:, EDGES].reshape(-1, 2))[1]
+        for own in (np.flatnonzero(piece == p) for p in np.unique(piece[lost])):
+            shape[own] = shape[own].mean(axis=0)  # else it would stay strained for ever
         v[: 3 * n].reshape(-1, 3)[lost] = 0.0
         self.inverse_mass.reshape(-1, 3)[lost] = 0.0
         self._u, self._v = u.copy(), v.copy()
+        self.model.restart_rotations(self.displacement)
         self._touched.append(np.arange(n))
         return True
 
