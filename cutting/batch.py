@@ -136,9 +136,8 @@ def build_batch(
         tables, mesh_nodes=mesh.node_count, tetrahedra=m, nodes=0, edges=0, parents=len(members)
     )
     adopt(links, tables, members)
-    parents = parents_concerned(links, tables, edges, nodes)
-    pieces, moves, worst, nodes = _sound_pieces(
-        mesh, positions, tables, parents, edges, nodes, scheme, limits
+    pieces, moves, worst, nodes, parents = _sound_pieces(
+        mesh, positions, tables, edges, nodes, scheme, limits
     )
     return _assemble(mesh, positions, tables, edges, nodes, parents, pieces, moves, worst)
 
@@ -154,15 +153,15 @@ def _sound_pieces(
     mesh: TetMesh,
     positions: np.ndarray,
     tables: Tables,
-    parents: np.ndarray,
     edges: np.ndarray,
     nodes: np.ndarray,
     scheme: Scheme,
     limits: SnapLimits,
-) -> tuple[Pieces, _Moves, float, np.ndarray]:
+) -> tuple[Pieces, _Moves, float, np.ndarray, np.ndarray]:
     """Divide the parents; below the altitude floor at midpoints, then at nodes, and otherwise not
-    at all. Return also the nodes on the cut.
+    at all. Return also the nodes on the cut, and the parents.
     """
+    parents = parents_concerned(mesh.links, tables, edges, nodes)
     front = scheme.tau if scheme.true_points else 0.5
     plain = np.zeros(0, np.int64)
     sliding = nodes if scheme.slides else nodes[:0]
@@ -187,9 +186,11 @@ def _sound_pieces(
             nodes = np.concatenate([nodes, *more])
             if not sum(map(len, more)) and not sum(block(tables, int(p), edges) for p in bad):
                 break
+            # Those around the nodes that were put on the cut just now.
+            parents = parents_concerned(mesh.links, tables, edges, nodes)
     if len(pieces.corners) and worst <= 0.0:
         raise CutStateError('an element would be inverted; abort the stroke')
-    return pieces, moves, float(worst), nodes
+    return pieces, moves, float(worst), nodes, parents
 
 
 def _soften(tables: Tables, bad: np.ndarray, edges: np.ndarray) -> np.ndarray:

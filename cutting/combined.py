@@ -8,18 +8,24 @@ from cutting_trainer.cutting.batch import CutStateError, Scheme, build_batch, gi
 from cutting_trainer.cutting.broad_phase import quad
 from cutting_trainer.cutting.crossings import find_hits, lengthened, met_tetrahedra, surfaces
 from cutting_trainer.cutting.geometry import smallest_altitudes
+from cutting_trainer.cutting.junctions import part_junctions
 from cutting_trainer.cutting.lookup import NODES, clear, empty_tables, with_room
 from cutting_trainer.cutting.method import CutResult, check_sweep
 from cutting_trainer.cutting.snapping import SnapLimits, SnapStroke, conflicts, register
 from cutting_trainer.cutting.state_table import active_list, pending
 from cutting_trainer.cutting.waiting import settle_waiting
 from cutting_trainer.tissue_sim.contact.blade import Sweep
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, grown
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, grown
 
 _ROOM_FOR_CHILDREN = 6.0
 _NEAR = 0.5
 """Distance from the surface at which a node with a contradicted side is put on the cut, as a share
 of the median altitude."""
+_STRIP = 2.5
+"""Way that is remembered of each end of a stroke, in edges."""
+_MAX_STRIPS = 32
+_EDGE = 1.5
+"""Edge of a well-shaped element, in altitudes."""
 _ENOUGH = 20000
 """Elements in the sample for a median."""
 FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
@@ -49,6 +55,8 @@ class CombinedMethod:
         self._located = False
         self._seen = np.zeros(0, np.int64)
         self._mark = 0
+        self._lines = np.zeros((0, 2, 3))
+        self._strips: list[np.ndarray] = []
 
     def advance(self, mesh: TetMesh, positions: np.ndarray, sweep: Sweep) -> CutResult:
         """Cut along a sweep, except in the elements around the blade."""
@@ -67,10 +75,12 @@ class CombinedMethod:
     def abort(self) -> None:
         """Forget the stroke; the mesh stays unchanged."""
         self._queue.clear()
+        self._strips.clear()
         self._tables = empty_tables()
         self._forget()
 
     def _forget(self) -> None:
+        self._lines = self._lines[:0]
         self._size = (-1, -1)
         self._last = np.zeros((4, 3))
         self._direction = np.zeros(3)
@@ -86,21 +96,59 @@ class CombinedMethod:
             touched += met
             if not folded:
                 self._last = self._queue.pop(0)
+                self._trace(mesh, positions)
         if finish or folded:
             self._round_off(mesh, positions)
         active = self._active[:0] if finish or folded else self._active
         settle_waiting(active, self._stroke(mesh, positions), self._scheme.subdivides)
         batch = build_batch(mesh, positions, self._tables, active, self._scheme, self._limits())
         self._tables = batch.tables
+        delta, area = batch.delta, batch.report.area
         if folded:
             warnings.append(FOLDED)
         if finish or folded:
-            self._empty_tables(mesh, batch.delta.node_parents.shape[0])
-        self._size = batch.size
+            delta, more = self._join_strokes(mesh, delta)
+            area += more
+            self._empty_tables(mesh, delta.node_parents.shape[0])
+        further = len(delta.node_parents) - len(batch.delta.node_parents)
+        self._size = (batch.size[0] + further, batch.size[1])
         report = replace(
-            batch.report, touched=touched, warnings=tuple(warnings) + batch.report.warnings
+            batch.report,
+            touched=touched,
+            area=area,
+            warnings=tuple(warnings) + batch.report.warnings,
         )
-        return CutResult(batch.delta, report)
+        return CutResult(delta, report)
+
+    def _trace(self, mesh: TetMesh, positions: np.ndarray) -> None:
+        """Remember where the blade went, in the rest shape of the elements around it."""
+        if not len(self._active):
+            return
+        nodes = np.unique(self._active)
+        near = np.column_stack([positions[nodes], np.ones(len(nodes))])
+        to_rest = np.linalg.lstsq(near, mesh.rest[nodes], rcond=None)[0]
+        corners = np.column_stack([self._last, np.ones(4)]) @ to_rest
+        edge = corners[[3, 2]]
+        if not len(self._lines):
+            self._lines = corners[None, :2]
+        way = np.linalg.norm(edge - self._lines[-1], axis=1).mean()
+        if way > 0.2 * _EDGE * self._altitude:
+            self._lines = np.concatenate([self._lines, edge[None]])
+
+    def _join_strokes(self, mesh: TetMesh, delta: TopologyDelta) -> tuple[TopologyDelta, float]:
+        """Part the tissue where this stroke meets the ends of earlier ones; remember its ends."""
+        h = _EDGE * self._altitude
+        lines, self._lines = self._lines, self._lines[:0]
+        if not self._scheme.reach or len(lines) < 2:
+            return delta, 0.0
+        ends = []
+        for one in (lines, lines[::-1]):
+            way = np.cumsum(np.linalg.norm(np.diff(one, axis=0), axis=2).mean(axis=1))
+            ends.append(np.ascontiguousarray(one[: 2 + int(np.searchsorted(way, _STRIP * h))]))
+        nodes = self._tables.node_id[: self._tables.counts[NODES]]
+        delta, area = part_junctions(mesh, delta, nodes, ends, self._strips, h)
+        self._strips = [*self._strips, *ends][-_MAX_STRIPS:]
+        return delta, area
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
         """Lead the cut on by the reach, where a stroke ends inside the tissue."""

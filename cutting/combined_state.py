@@ -70,6 +70,9 @@ def check_combined(method: Any, mesh: TetMesh) -> None:
     has_room('_active', method._active, 0, 4)
     has_room('_direction', method._direction, 3)
     has_room('_last', method._last, 4, 3)
+    has_room('_lines', method._lines, 0, 2, 3)
+    for strip in method._strips:
+        has_room('_strips', strip, 2, 2, 3)
     size = len(t.hash_key)
     if size < 2 or size & (size - 1) or not (t.hash_key == -1).any():
         raise StateError('hash_key is no table with room')

@@ -9,6 +9,7 @@ from bench.cuts.curves import (
     Organ,
     circle,
     curved,
+    four_arcs,
     four_lines,
     liver,
     organ_of,
@@ -17,7 +18,7 @@ from bench.cuts.curves import (
 )
 from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free
 from bench.cuts.strokes import good_block
-from cutting_trainer.cutting.checks import check_mesh, cut_face_area
+from cutting_trainer.cutting.checks import check_area, check_mesh, cut_face_area
 from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
@@ -65,6 +66,30 @@ def test_four_lines_free_a_square(plate):
 @pytest.fixture(scope='module')
 def cloud() -> Organ:
     return scattered()
+
+
+def test_strokes_that_meet_at_their_ends_free_a_plug(plate):
+    """Each ends at its front; the tissue between them is parted, and its area is told."""
+    cut = four_arcs(plate, 2, np.random.default_rng(0))
+    mesh = TetMesh(plate.nodes.copy(), plate.tetrahedra.copy())
+    volume, area = float(mesh.volumes().sum()), 0.0
+    cutter = method_named()
+    for path in cut.paths:
+        area += sum(result.report.area for result in draw(cutter, mesh, path))
+    assert plug_is_free(mesh, cut, plate.h)
+    check_mesh(mesh, volume)
+    check_area(mesh, area)
+
+
+def test_strokes_that_cross_near_their_ends_free_a_plug():
+    organ = slab()
+    run = measure(organ, four_lines(organ, 4, np.random.default_rng(6)))
+    assert run.error == '' and run.free
+
+
+def test_elements_around_a_node_put_on_the_cut_are_divided_anew(cloud):
+    run = measure(cloud, curved(cloud, 'loop', np.random.default_rng(1015)))
+    assert run.error == '' and run.faces == 0
 
 
 def test_slivers_are_cut_at_their_nodes(cloud):

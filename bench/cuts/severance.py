@@ -5,9 +5,12 @@ other, within a tube around it and away from its free border.
 """
 
 import argparse
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -290,33 +293,52 @@ def _row(name: str, runs: list[Severed]) -> None:
             print('   ', run.error[:150])
 
 
-def fuzz(organ: Organ, count: int, seed: int) -> dict[str, float]:
+def fuzz(organ: Organ, count: int, seed: int, kept: Path) -> dict[str, float]:
     """Cut copies of a mesh by random curves, each once, and count bridges and violations.
 
     Args:
         organ: mesh.
         count: strokes.
         seed: of the first stroke; each has the next one.
+        kept: file of results, one line each; strokes in it are not cut again.
     """
-    totals = dict.fromkeys(('strokes', 'unsaid', 'said', 'violations'), 0.0)
-    off: list[Floats] = []
+    lines = kept.read_text().splitlines() if kept.exists() else []
+    runs = {run['seed']: run for run in map(json.loads, lines)}
     for k in range(seed, seed + count):
-        rng = np.random.default_rng(k)
-        shape = str(rng.choice(list(SHAPES)))
-        cut = curved(organ, shape, rng, through=bool(rng.integers(2)))
-        run = measure(organ, cut)
-        totals['strokes'] += 1
-        totals['unsaid'] += run.faces > 0 and not run.said
-        totals['said'] += bool(run.said)
-        totals['violations'] += bool(run.error)
-        off.append(run.distances)
-        if run.faces or run.error:
-            print(f'{shape}, seed {k}: {run.faces} faces at {run.bridges[:1]}, {run.error[:150]}')
-    distances = np.concatenate(off)
-    totals['rms'] = float(np.sqrt((distances**2).mean()))
-    totals['most'] = float(distances.max())
-    totals['beyond 0.15'] = float((distances > 0.15).mean())
-    return totals
+        if k not in runs:
+            runs[k] = _random_stroke(organ, k)
+            with kept.open('a') as file:
+                print(json.dumps(runs[k]), file=file)
+    chosen = [runs[k] for k in range(seed, seed + count)]
+    nodes = sum(run['nodes'] for run in chosen)
+    return {
+        'strokes': len(chosen),
+        'unsaid': sum(run['faces'] > 0 and not run['said'] for run in chosen),
+        'said': sum(run['said'] for run in chosen),
+        'violations': sum(bool(run['error']) for run in chosen),
+        'rms': float(np.sqrt(sum(run['squares'] for run in chosen) / max(nodes, 1))),
+        'most': max(run['most'] for run in chosen),
+        'beyond 0.15': sum(run['beyond'] for run in chosen) / max(nodes, 1),
+    }
+
+
+def _random_stroke(organ: Organ, seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    shape = str(rng.choice(list(SHAPES)))
+    run = measure(organ, curved(organ, shape, rng, through=bool(rng.integers(2))))
+    if run.faces or run.error:
+        print(f'{shape}, seed {seed}: {run.faces} faces at {run.bridges[:1]}, {run.error[:150]}')
+    off = run.distances
+    return {
+        'seed': seed,
+        'faces': run.faces,
+        'said': bool(run.said),
+        'error': run.error,
+        'nodes': len(off),
+        'squares': float((off**2).sum()),
+        'most': float(off.max(initial=0.0)),
+        'beyond': int((off > 0.15).sum()),
+    }
 
 
 def main() -> None:
@@ -327,13 +349,16 @@ def main() -> None:
     parser.add_argument('--organs', nargs='*', default=['slab', 'liver', 'scattered'])
     parser.add_argument('--curves', type=int, default=20, help='random curves of each shape')
     parser.add_argument('--shapes', nargs='*', default=['circle', 'four arcs', 'four lines'])
-    parser.add_argument('--fuzz', type=int, default=0, help='random curves only, so many')
+    parser.add_argument('--fuzz', type=int, default=0, help='random curves in the first mesh only')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--kept', type=Path, default=Path('severance.jsonl'), help='of the fuzz')
     options = parser.parse_args()
-    if options.fuzz:
-        print(fuzz(slab((9, 9, 4)), options.fuzz, options.seed))
-        return
     makers = {'slab': slab, 'liver': liver, 'scattered': scattered}
+    if options.fuzz:
+        name = options.organs[0]
+        organ = slab((9, 9, 4)) if name == 'slab' else makers[name]()
+        print(fuzz(organ, options.fuzz, options.seed, options.kept))
+        return
     for organ in (makers[name]() for name in options.organs):
         ratios = [2, 3, 4] if organ.name == 'liver' else [2, 3, 4, 6]
         for name in options.shapes:
