@@ -30,17 +30,26 @@ class Patch(NamedTuple):
 
 @inner
 def _side(corners, tables, positions):
-    """Return the side of a whole tetrahedron: of a node, else of its centre above its nodes'
-    planes.
+    """Return the side of a whole tetrahedron: of a node, else of its node beyond the face on the
+    cut, else of its centre above its nodes' planes.
     """
     x = y = z = 0.0
+    beyond = -1
+    unknown = 0
     for i in range(4):
         row = tables.node_row[origin_of(tables, corners[i])]
         if row >= 0 and tables.node_side[row] != SNAPPED:
             return np.int64(tables.node_side[row])
+        if row < 0:
+            beyond = corners[i]
+            unknown += 1
         x += 0.25 * positions[corners[i], 0]
         y += 0.25 * positions[corners[i], 1]
         z += 0.25 * positions[corners[i], 2]
+    # The cut goes through the face itself, also where its nodes lie off the swept surface.
+    single = unknown == 1
+    if single:
+        x, y, z = positions[beyond, 0], positions[beyond, 1], positions[beyond, 2]
     height = 0.0
     for i in range(4):
         row = tables.node_row[origin_of(tables, corners[i])]
@@ -49,7 +58,8 @@ def _side(corners, tables, positions):
             height += tables.node_plane[row, 0] * (x - positions[at, 0])
             height += tables.node_plane[row, 1] * (y - positions[at, 1])
             height += tables.node_plane[row, 2] * (z - positions[at, 2])
-            height += tables.node_plane[row, 3]
+            if not single:
+                height += tables.node_plane[row, 3]
     return np.int64(1) if height >= 0.0 else np.int64(-1)
 
 

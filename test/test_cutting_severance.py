@@ -106,6 +106,13 @@ def test_a_crossing_around_the_blade_may_end_at_a_node_put_on_the_cut(cloud, see
     assert run.error == '' and run.faces == 0
 
 
+def test_a_face_off_the_swept_surface_is_opened():
+    """Three nodes on the cut, two of them off the surface, and nothing known of the fourth."""
+    organ = liver()
+    run = measure(organ, curved(organ, 'spiral', np.random.default_rng(1007)))
+    assert run.error == '' and run.faces == 0
+
+
 def test_nodes_that_slide_beside_each_other_keep_the_volume():
     """The end of an old cut slides along the outline as its neighbour has left it."""
     organ = liver()
