@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from bench.validate.blade import E0, FIRM, drawn
 from bench.validate.case import Result
 from bench.validate.cases import CASES, NOT_REPRODUCED
 from bench.validate.command import run_validate, tables
@@ -44,6 +45,19 @@ def test_the_cube_has_the_stress_of_the_law_in_tension_and_shear() -> None:
     assert cube.shear(1.0) == pytest.approx(mu, rel=1e-3)
 
 
+@pytest.mark.parametrize('cell', [0.0053, 0.0044])
+def test_the_steady_force_of_a_blade_is_toughness_times_its_depth(cell: float) -> None:
+    found = drawn('stiffening', 187.0, E0, cell)
+    assert found.force[0] == pytest.approx(187.0 * found.depth, rel=0.06)
+
+
+def test_a_blade_that_slices_feels_the_force_of_atkins() -> None:
+    found = drawn('stiffening', 76.0, FIRM, 0.0053, 1.5)
+    across = 76.0 * found.depth / (1 + 1.5**2)
+    assert found.force[0] == pytest.approx(across, rel=0.1)
+    assert -found.force[2] == pytest.approx(1.5 * across, rel=0.1)
+
+
 def test_a_result_without_a_value_is_outside_and_its_reason_is_in_the_table() -> None:
     lost = Result('force', 'linear', 6, 'N', 1.0, None, None, 0.1, 'nothing is cut')
     assert not lost.inside(1.0)
@@ -59,5 +73,5 @@ def test_the_picture_labels_each_case_at_its_line() -> None:
 
 
 def test_an_unknown_case_is_refused_with_the_names_there_are() -> None:
-    with pytest.raises(SessionError, match='toughness, stiffness, truth-cube'):
+    with pytest.raises(SessionError, match='toughness, stiffness, slicing, truth-cube'):
         run_validate(['spleen'], quick=True)

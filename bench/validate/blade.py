@@ -1,8 +1,10 @@
-"""Steady force of a blade drawn through a block, against toughness times length of edge."""
+"""Steady force of a blade drawn through a block, against toughness times length of edge, and
+against Atkins' force of a blade that slices.
+"""
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -23,7 +25,7 @@ from cutting_trainer.tissue_sim.simulation.cut_transaction import CutTransaction
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 SIZE = (0.064, 0.024, 0.016)
-"""Block, fixed at its underside [m]."""
+"""Block, fixed at its underside, to half a cell [m]."""
 DEPTH = 0.0055
 """Depth of the blade's tip below the surface at rest [m]."""
 START, STROKE, SPEED = 0.008, 0.048, 0.08
@@ -52,6 +54,13 @@ TOUGHNESSES = {
 MODULI = (2700.0, 5400.0, 10800.0, 21600.0)
 """Young's moduli of the same toughness [Pa]."""
 SAME_TOUGHNESS = 164.0
+SLICE_PUSH = (0.0, 0.5, 1.0, 2.0, 4.0)
+SLICED, FIRM = 76.0, 21600.0
+"""Toughness of the tissue that is sliced [J/m^2], and its modulus [Pa]: it yields so little that
+the force is steady on a short way."""
+BELOW, EDGE, STIFF, SLICE = 0.003, 0.085, 2000.0, 0.016
+"""How far the tip of a slicing blade is below the block at first [m], length of its edge [m],
+stiffness of its coupling [N/m]; its way along x [m]."""
 E0, STIFFENING = 5400.0, 6.0
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -61,20 +70,28 @@ class Drawn:
     """A blade drawn through the block.
 
     Attributes:
-        force: along its way, mean of the last part [N].
+        force: that the hand needs, mean of the last part of the way [N], shape (3,).
+        depth: of the blade's tip below the surface at rest, or the height of the block [m].
         cut: elements that were cut.
         tetrahedra: before the cut.
         cpu: CPU time [s].
     """
 
-    force: float
+    force: np.ndarray
+    depth: float
     cut: int
     tetrahedra: int
     cpu: float
 
 
 @cache
-def drawn(model: ModelName, toughness: float, youngs_modulus: float, cell: float) -> Drawn:
+def drawn(
+    model: ModelName,
+    toughness: float,
+    youngs_modulus: float,
+    cell: float,
+    slice_push: float | None = None,
+) -> Drawn:
     """Draw a blade without friction along x.
 
     Args:
@@ -82,11 +99,13 @@ def drawn(model: ModelName, toughness: float, youngs_modulus: float, cell: float
         toughness: J [J/m^2].
         youngs_modulus: at small strain [Pa].
         cell: edge of a cube of twelve tetrahedra [m].
+        slice_push: speed along the edge over speed along x, of a blade through the whole block;
+            None: the blade's tip stays at its depth.
     """
     cells = tuple(round(s / cell) for s in SIZE)
     nodes, tetrahedra = good_block((cells[0], cells[1], cells[2]), cell, seed=1)
     mesh = TetMesh(nodes, tetrahedra, nodes[:, 2] < 1e-9)
-    count = len(mesh.tetrahedra)
+    count, top = len(mesh.tetrahedra), float(nodes[:, 2].max())
     material = Material(youngs_modulus, 0.45, 1060.0, 15.0, 1e-4, STIFFENING)
     simulation = TissueSimulation(
         mesh,
@@ -97,26 +116,32 @@ def drawn(model: ModelName, toughness: float, youngs_modulus: float, cell: float
     )
     method, asks = make_method(CuttingSettings()), CutTransaction(simulation)
     forces = []
+    depth = DEPTH if slice_push is None else top + BELOW
     start = time.thread_time()
-    for tip in _way():
+    stroke = STROKE if slice_push is None else SLICE
+    for tip in _way(top, depth, stroke, slice_push or 0.0):
         if asks.due and asks.asked is not None:
             asks.resolve(*answer(method, asks.asked, simulation))
-        place = np.array([tip[0], tip[1], SIZE[2]])
-        frame = simulation.frame(blade_contact(mesh, ContactState.TOUCHING, place, tip, _UP))
+        place = np.array([tip[0], tip[1], top])
+        contact = blade_contact(mesh, ContactState.TOUCHING, place, tip, _UP)
+        if slice_push is not None:
+            contact = replace(contact, blade_root=tip + EDGE * _UP, stiffness=STIFF)
+        frame = simulation.frame(contact)
         asks.ask(frame)
-        forces.append(-frame.force[0])
+        forces.append(-frame.force)
     cpu = time.thread_time() - start
-    steady = float(np.mean(forces[-round(STEADY * STROKE / SPEED * RATE) :]))
-    return Drawn(steady, simulation.elements_cut, count, cpu)
+    steady = np.mean(forces[-round(STEADY * stroke / SPEED * RATE) :], axis=0)
+    return Drawn(steady, min(depth, top), simulation.elements_cut, count, cpu)
 
 
-def _way() -> np.ndarray:
-    top = SIZE[2]
-    down = np.linspace(top + 0.0005, top - DEPTH, round((DEPTH + 0.0005) / ENTRY * RATE))
-    along = np.linspace(START, START + STROKE, round(STROKE / SPEED * RATE))
+def _way(top: float, depth: float, stroke: float, slice_push: float) -> np.ndarray:
+    """Return tips of the blade by frame [m], shape (k, 3)."""
+    down = np.linspace(top + 0.0005, top - depth, round((depth + 0.0005) / ENTRY * RATE))
+    along = np.linspace(START, START + stroke, round(stroke / SPEED * RATE))
     y = SIZE[1] / 2 + 0.0007
     first = np.stack([np.full_like(down, START), np.full_like(down, y), down], axis=1)
-    then = np.stack([along, np.full_like(along, y), np.full_like(along, top - DEPTH)], axis=1)
+    low = top - depth - slice_push * (along - START)
+    then = np.stack([along, np.full_like(along, y), low], axis=1)
     return np.concatenate([first, then])
 
 
@@ -139,6 +164,32 @@ def run_stiffness(quick: bool) -> list[Result]:
     ]
 
 
+def run_slicing(quick: bool) -> list[Result]:
+    """Return the force across and along the edge by the slice/push ratio, after Atkins."""
+    results = []
+    for cell in CELLS[:1] if quick else CELLS:
+        for ratio in SLICE_PUSH:
+            found = drawn('stiffening', SLICED, FIRM, cell, ratio)
+            both = SLICED * found.depth / (1 + ratio**2)
+            for name, exact, axis in (('across', both, 0), ('along', ratio * both, 2)):
+                if exact == 0.0:
+                    continue
+                force = abs(float(found.force[axis]))
+                results.append(
+                    Result(
+                        f'slice/push {ratio:g}, force {name} the edge',
+                        'stiffening',
+                        found.tetrahedra,
+                        'N',
+                        exact,
+                        force,
+                        force / exact - 1,
+                        found.cpu,
+                    )
+                )
+    return results
+
+
 def _meshes(
     values: tuple[float, ...], middle: float, *, quick: bool
 ) -> Iterator[tuple[float, float]]:
@@ -153,9 +204,11 @@ def _against(
     quantity: str, model: ModelName, toughness: float, modulus: float, cell: float
 ) -> Result:
     found = drawn(model, toughness, modulus, cell)
-    exact = toughness * DEPTH
+    exact = toughness * found.depth
     if found.cut < MIN_CUT:
         note = 'the tissue gives way, nothing is cut'
         return Result(quantity, model, found.tetrahedra, 'N', exact, None, None, found.cpu, note)
-    error = found.force / exact - 1
-    return Result(quantity, model, found.tetrahedra, 'N', exact, found.force, error, found.cpu)
+    force = float(found.force[0])
+    return Result(
+        quantity, model, found.tetrahedra, 'N', exact, force, force / exact - 1, found.cpu
+    )

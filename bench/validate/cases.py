@@ -8,6 +8,9 @@ GOKGOL = Source(
     'Gokgol, Basdogan, Canadinc 2012', 'doi 10.1016/j.medengphy.2011.09.030', 'abstract'
 )
 MAHVASH = Source('Mahvash et al. 2008', 'doi 10.1109/TBME.2007.908069', 'abstract')
+ATKINS = Source(
+    'Atkins, Xu, Jeronimidis 2004', 'doi 10.1023/B:JMSC.0000021451.17182.86', 'abstract'
+)
 TRUTH_CUBE = Source(
     'Kerdok et al. 2003, Truth Cube',
     'doi 10.1016/s1361-8415(03)00008-2; biorobotics.harvard.edu/truthcube/truthcube.html',
@@ -40,6 +43,14 @@ CASES: dict[str, Case] = {
             0.10,
             'chosen here',
             blade.run_stiffness,
+        ),
+        Case(
+            'slicing',
+            'Force across and along the edge of a blade that slices, slice/push 0 to 4',
+            (ATKINS,),
+            0.10,
+            'chosen here',
+            blade.run_slicing,
         ),
         Case(
             'truth-cube',
@@ -138,9 +149,4 @@ NOT_REPRODUCED = (
         'a needle spreads the tissue: it needs tools of a thickness',
     ),
     NotReproduced('Scissors: force over the angle', MAHVASH, 'it needs two blades that close'),
-    NotReproduced(
-        'Slicing: force falls with the slice/push ratio',
-        Source('Mora and Pomeau 2020', 'arXiv 2003.09185', 'abstract'),
-        'the force of the blade knows no speed along its edge',
-    ),
 )

@@ -33,6 +33,8 @@ _AHEAD = 1e-4
 _MEDIAN_SAMPLES = 20000
 """Elements in the sample for a median."""
 _MAX_SLIPS = 12
+_MAX_STEPS = 100
+"""Places at which tissue is looked for between an edge in the air and the device's."""
 _MAX_FREE_SLIP = BLADE_THICKNESS / 2
 """[m] by which the edge slips along a cut before what is ahead of it is looked up again."""
 _SETTLED = 1e-6
@@ -41,6 +43,8 @@ _MIN_POINTS = 4
 """Points in the tissue from which on they tell the direction of the edge."""
 _ONE_WAY = 0.3
 """Share of the springs' forces in their sum from which on the tissue is loaded point by point."""
+_PARTS = np.arange(1, 9) / 8
+"""Places of a piece at which the end of the tissue is looked for."""
 _SHARES = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
 _KNOTS = np.rint(np.linspace(0, _SAMPLES - 1, KNOTS)).astype(int)
 
@@ -77,12 +81,12 @@ class Resistance:
     friction: float
 
     def forces(
-        self, piece: float, fresh: np.ndarray, edge: np.ndarray, ways: np.ndarray
+        self, piece: np.ndarray, fresh: np.ndarray, edge: np.ndarray, ways: np.ndarray
     ) -> np.ndarray:
         """Return the largest force that each piece of the edge transmits [N], shape (p,).
 
         Args:
-            piece: its length [m].
+            piece: their lengths [m], shape (p,).
             fresh: 1 where uncut tissue is ahead, else 0, shape (p,).
             edge: unit vector along the edge, shape (3,).
             ways: along which the pieces are pulled, shape (p, 3).
@@ -130,8 +134,10 @@ class Blade:
         self._inside = np.zeros(_SAMPLES, bool)
         self._corners = np.zeros((0, 4), np.int64)
         self._parts = np.zeros((0, 4))
+        self._spans = np.zeros(0)
         self._fracture = CutStrips()
         self._element = 0.0
+        self._grip = 0.0
         self._back: np.ndarray | None = None
         self._failed = self._set_back = False
         self.immersed = self.limit = self.lag = self.paid = self.rubbed = 0.0
@@ -154,17 +160,38 @@ class Blade:
     def carry(self, positions: np.ndarray) -> None:
         """Move the edge with the tissue.
 
+        The edge is rigid: tissue that slides along it takes it along by no more than friction does,
+        or a hand that slices (Atkins). Else the tissue that heaps up before a blade would lift the
+        edge out.
+
         Args:
             positions: nodes now, of the same mesh as at the last `follow` [m], shape (n, 3).
         """
         if not self._inside.any():
             return
-        before, points = self._points[self._inside], self._points.copy()
-        points[self._inside] = np.einsum('ij,ijk->ik', self._parts, positions[self._corners])
-        self._points = points
-        at, along = _line(_SHARES[self._inside], points[self._inside] - before)
+        before = self._points[self._inside]
+        carried = np.einsum('ij,ijk->ik', self._parts, positions[self._corners])
+        unit, device = self._direction(), self._device_points()[self._inside]
+        most = self._along(device - before, unit)
+        stretch = (device - carried) @ unit
+        slid = stretch - np.clip(stretch, -most, most)
+        self._points = self._points.copy()
+        self._points[self._inside] = carried + slid[:, None] * unit
+        shares = _SHARES[self._inside]
+        at, along = _line(shares, carried - before)
         self._cut_tip, self._cut_edge = self._cut_tip + at, self._cut_edge + along
-        self._fracture.carry(at + along * float(_SHARES[self._inside].mean()))
+        ways = at + along * np.clip(_SHARES[_KNOTS], shares[0], shares[-1])[:, None]
+        self._fracture.carry(ways - (ways @ unit)[:, None] * unit)
+
+    def _along(self, stretch: np.ndarray, unit: np.ndarray) -> np.ndarray:
+        """Return the largest stretch along the edge to which tissue may take it [m], shape (p,)."""
+        parts = []
+        for ways in (stretch, self._moved[self._inside]):
+            along = ways @ unit
+            parts += [np.abs(along), np.linalg.norm(ways - along[:, None] * unit, axis=1)]
+        held, pulled, sliced, pushed = parts
+        sliced = np.where(pushed > 0.0, sliced / np.maximum(pushed, 1e-12), 0.0)
+        return np.maximum(np.maximum(held, self._grip), sliced * pulled)
 
     def follow(
         self,
@@ -189,7 +216,9 @@ class Blade:
             self._element = 2 * float(np.cbrt(np.median(volumes)))
         before = self._device_points()
         self._device = device.copy()
+        self._grip = self._resistance.friction * self._piece() / (stiffness / _WHOLE)
         self._moved = self._device_points() - before
+        self._points = self._lagging()
         self._immerse(mesh, positions)
         cuts = np.zeros((0, 3, 3))
         if not self._inside.any():
@@ -209,6 +238,7 @@ class Blade:
         """Let the edge follow the device without force: nothing is known of the tool."""
         self._inside = np.zeros(_SAMPLES, bool)
         self._corners, self._parts = np.zeros((0, 4), np.int64), np.zeros((0, 4))
+        self._spans = np.zeros(0)
         self._fracture.forget()
         self._settle(0.0, np.zeros((0, 3, 3)))
 
@@ -226,8 +256,8 @@ class Blade:
         count = len(self._corners)
         if count == 0:
             return Coupling()
-        forces = self._stretch() @ self.force
-        loads = np.full(count, 1 / count)
+        forces = self._spans * (self._stretch() @ self.force)
+        loads = self._spans / self._spans.sum()
         if self.force @ self.force > 0.0 and forces.sum() > _ONE_WAY * np.abs(forces).sum():
             loads = forces / forces.sum()
         nodes, slots = np.unique(self._corners, return_inverse=True)
@@ -235,7 +265,7 @@ class Blade:
         middle = float(_SHARES[self._inside].mean())
         moved = (1 - middle) * (ahead[1] - self._device[1]) + middle * (ahead[0] - self._device[0])
         rate = moved / (1 - share) if share < 1 else np.zeros(3)
-        whole = stiffness * count / _WHOLE
+        whole = stiffness * float(self._spans.sum()) / _WHOLE
         at = weights @ positions[nodes] + self.force / whole
         return Coupling(
             mode=HOLD,
@@ -256,31 +286,107 @@ class Blade:
         return np.asarray((self._device_points() - self._points)[self._inside])
 
     def _immerse(self, mesh: TetMesh, positions: np.ndarray) -> None:
-        """Find the points in the tissue. The others follow the device."""
-        points, device = self._points, self._device_points()
-        points = np.where(self._inside[:, None], points, device)
-        for _ in range(2):
-            found = np.empty(_SAMPLES, np.int64)
-            parts = np.empty((_SAMPLES, 4))
-            locate_points(
-                positions, mesh.tetrahedra, mesh.neighbors, points, self._hint, found, parts
-            )
+        """Find the points in the tissue. Those in the air go with them: the edge is rigid.
+
+        Where a cut gapes so far that all are in the air, the edge goes on to the tissue before it,
+        which has still to be cut, or else to the device's.
+        """
+        before = np.full(_SAMPLES, 0.5)
+        before[self._inside] = self._spans
+        found, parts = self._locate(mesh, positions, self._points)
+        lost = self._inside & (found < 0)
+        if (found < 0).all():
+            self._points = self._before_tissue(mesh, positions)
+            found, parts = self._locate(mesh, positions, self._points)
+        elif lost.any():
             self._inside = found >= 0
-            left = ~self._inside & (points != device).any(axis=1)
-            if not left.any():
-                break
-            points = np.where(left[:, None], device, points)
-        self._points = points
+            self._points = np.where(lost[:, None], self._lagging(), self._points)
+            found, parts = self._locate(mesh, positions, self._points)
+        self._inside = found >= 0
         self._corners = mesh.tetrahedra[found[self._inside]].astype(np.int64)
         self._parts = parts[self._inside]
         if len(self._corners):
             self._hint = int(found[self._inside][0])
+        lengths = self._lengths(mesh, positions)
+        self._spans = lengths[self._inside]
+        grown = np.where(self._inside, np.sqrt(before / np.maximum(lengths, 1e-12)), 1.0)
+        self._relax(mesh, positions, grown)
+
+    def _lagging(self) -> np.ndarray:
+        """Return the points, with those in the air as far behind as the nearest in the tissue."""
+        points = self._device_points()
+        if not self._inside.any():
+            return points
+        shares, stretch = _SHARES[self._inside], self._stretch()
+        lag = np.column_stack([np.interp(_SHARES, shares, part) for part in stretch.T])
+        return np.where(self._inside[:, None], self._points, points - lag)
+
+    def _locate(
+        self, mesh: TetMesh, positions: np.ndarray, points: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tetrahedron of each point or -1, and the barycentric coordinates in it."""
+        found, parts = np.empty(len(points), np.int64), np.empty((len(points), 4))
+        locate_points(positions, mesh.tetrahedra, mesh.neighbors, points, self._hint, found, parts)
+        return found, parts
+
+    def _before_tissue(self, mesh: TetMesh, positions: np.ndarray) -> np.ndarray:
+        """Return an edge in the air where it meets tissue on its way to the device's [m]."""
+        device = self._device_points()
+        ways = device - self._points
+        longest = float(np.linalg.norm(ways, axis=1).max())
+        steps = min(int(np.ceil(longest / (BLADE_THICKNESS / 2))), _MAX_STEPS)
+        if steps == 0:
+            return device
+        shares = np.arange(1, steps + 1) / steps
+        on_way = device - (1 - shares)[:, None, None] * ways
+        found, _ = self._locate(mesh, positions, on_way.reshape(-1, 3))
+        meets = (found >= 0).reshape(steps, -1).any(axis=1)
+        return np.asarray(on_way[int(meets.argmax())] if meets.any() else device)
+
+    def _lengths(self, mesh: TetMesh, positions: np.ndarray) -> np.ndarray:
+        """Return how much of the edge each point would stand for [pieces], shape (48,).
+
+        At the end of the tissue it is what is left to there, so that the force does not change in
+        steps of a piece as the blade goes in.
+        """
+        inside, lengths = self._inside, np.ones(_SAMPLES)
+        upper = np.flatnonzero(inside[:-1] & ~inside[1:])
+        lower = np.flatnonzero(inside[1:] & ~inside[:-1]) + 1
+        at = np.concatenate([upper, lower])
+        if len(at):
+            step = (self._device[0] - self._device[1]) / _SAMPLES
+            ways = np.concatenate([np.ones(len(upper)), -np.ones(len(lower))])[:, None] * step
+            beyond = self._points[at][:, None] + _PARTS[:, None] * ways[:, None]
+            found, _ = self._locate(mesh, positions, beyond.reshape(-1, 3))
+            reached = np.cumprod(found.reshape(len(at), -1) >= 0, axis=1).mean(axis=1)
+            np.add.at(lengths, at, reached - 0.5)
+        return np.maximum(lengths, _PARTS[0])
+
+    def _relax(self, mesh: TetMesh, positions: np.ndarray, grown: np.ndarray) -> None:
+        """Spread the energy of points over the edge that has come into the tissue beside them.
+
+        Args:
+            mesh, positions: as for `follow`.
+            grown: root of the length that a point stood for over that it stands for now, (48,).
+        """
+        stretch = self._device_points() - self._points
+        at = np.flatnonzero((grown < 1) & (np.abs(stretch).max(axis=1) > _SETTLED))
+        if not len(at):
+            return
+        points = self._points[at] + (1 - grown[at])[:, None] * stretch[at]
+        found, parts = self._locate(mesh, positions, points)
+        at, found, parts, points = (x[found >= 0] for x in (at, found, parts, points))
+        slots = np.cumsum(self._inside)[at] - 1
+        self._points = self._points.copy()
+        self._points[at] = points
+        self._corners[slots], self._parts[slots] = mesh.tetrahedra[found], parts
 
     def _knots(self) -> np.ndarray:
-        """Return some points of the edge; those outside lag as much as the nearest inside [m]."""
-        shares, stretch = _SHARES[self._inside], self._stretch()
-        lag = np.column_stack([np.interp(_SHARES[_KNOTS], shares, part) for part in stretch.T])
-        return np.asarray(self._device_points()[_KNOTS] - lag)
+        """Return some points of the edge [m], shape (KNOTS, 3)."""
+        knots, half = self._lagging()[_KNOTS], (self._device[0] - self._device[1]) / _SAMPLES / 2
+        knots[0] -= half
+        knots[-1] += half
+        return knots
 
     def _piece(self) -> float:
         """Return the length of the edge that a point stands for [m]."""
@@ -295,21 +401,23 @@ class Blade:
         ways = self._stretch()
         fresh = np.empty(len(ways))
         look_ahead(self._points[self._inside], ways, cuts, BLADE_THICKNESS / 2, _AHEAD, fresh)
-        unit, piece, each = self._direction(), self._piece(), stiffness / _WHOLE
+        unit, each = self._direction(), stiffness / _WHOLE * self._spans
+        pieces = self._piece() * self._spans
         sizes = np.maximum(np.linalg.norm(ways, axis=1), 1e-300)
-        limits = self._resistance.forces(piece, fresh, unit, ways)
+        limits = self._resistance.forces(pieces, fresh, unit, ways)
         slid = np.maximum(sizes - limits / each, 0.0)
         slid = np.where(fresh == 0, np.minimum(slid, _MAX_FREE_SLIP), slid)
         if slid.max() < _SETTLED:
             return False
         ways *= (slid / sizes)[:, None]
-        rub = piece * self._resistance.friction * float(slid.sum())
+        rub = self._resistance.friction * float(pieces @ slid)
         self.paid += float(limits @ slid) - rub
         self.rubbed += rub
         cutting = bool((slid[fresh == 1] > _SETTLED).any())
         before = self._knots() if cutting else self._points
         self._points = self._points.copy()
         self._points[self._inside] += ways
+        self._points = self._lagging()
         if cutting:
             self._fracture.add(before, self._knots())
         else:
@@ -320,13 +428,14 @@ class Blade:
         """Update the output: force, torque, limit, and the edge as a line."""
         self.force, self.torque, self.limit, self.lag = np.zeros(3), np.zeros(3), 0.0, 0.0
         count = len(self._corners)
-        self.immersed = count * self._piece()
+        pieces = self._piece() * self._spans
+        self.immersed = float(pieces.sum())
         root, self._tip = self._device
         self._edge = root - self._tip
         if count == 0:
             return
         stretch, shares = self._stretch(), _SHARES[self._inside]
-        pulls = stiffness / _WHOLE * stretch
+        pulls = stiffness / _WHOLE * self._spans[:, None] * stretch
         self.force = pulls.sum(axis=0)
         self.torque = np.cross(shares[:, None] * self._edge, pulls).sum(axis=0)
         self.lag = float(np.linalg.norm(stretch.mean(axis=0)))
@@ -334,7 +443,7 @@ class Blade:
         for ways in (stretch.copy(), self._moved[self._inside]):
             fresh = np.empty(count)
             look_ahead(self._points[self._inside], ways, cuts, BLADE_THICKNESS / 2, _AHEAD, fresh)
-            limits = self._resistance.forces(self._piece(), fresh, self._direction(), ways)
+            limits = self._resistance.forces(pieces, fresh, self._direction(), ways)
             self.limit = max(self.limit, float(limits.sum()))
         if count < _MIN_POINTS:
             self._tip = self._tip - stretch.mean(axis=0)

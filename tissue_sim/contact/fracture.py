@@ -23,8 +23,8 @@ _MAX_SINE_ALONG_CUT = 0.5
 class CutStrips:
     """The latest strips cut by the edge, moved with the tissue.
 
-    Limitations: they move as one rigid piece with the tissue at the blade. This holds near the
-        blade; farther off the mesh has the cut. A motion up to 30 degrees off a cut counts as
+    Limitations: all of them move with the tissue at the blade. This holds near the blade; farther
+        off the mesh has the cut. A motion up to 30 degrees off a cut counts as
         along it.
     """
 
@@ -32,9 +32,9 @@ class CutStrips:
         self._strips = np.zeros((0, 2, KNOTS, 3))
         self._goes_on = False
 
-    def carry(self, way: np.ndarray) -> None:
-        """Move the strips with the tissue by a displacement [m], shape (3,)."""
-        self._strips = self._strips + way
+    def carry(self, ways: np.ndarray) -> None:
+        """Move the points of each strip with the tissue [m], shape (KNOTS, 3)."""
+        self._strips = self._strips + ways
 
     def add(self, before: np.ndarray, after: np.ndarray) -> None:
         """Add a strip cut by the edge.
@@ -60,7 +60,7 @@ class CutStrips:
         self._goes_on = False
 
     def behind(self, distance: float) -> np.ndarray | None:
-        """Return the edge at a distance [m] or more before the last strip's end.
+        """Return the edge at a distance [m] or more before the last strip's end, all along it.
 
         With too few strips it is the earliest edge, without any None.
 
@@ -68,7 +68,7 @@ class CutStrips:
             Its root and tip [m], shape (2, 3).
         """
         for strip in self._strips[::-1]:
-            if _path_length(strip[0], self._strips[-1, 1]) >= distance:
+            if np.linalg.norm(strip[0] - self._strips[-1, 1], axis=1).min() >= distance:
                 return np.asarray(strip[0][[-1, 0]])
         return np.asarray(self._strips[0, 0][[-1, 0]]) if len(self._strips) else None
 

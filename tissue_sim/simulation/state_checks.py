@@ -351,6 +351,7 @@ def _check_blade(simulation: TissueSimulation, n: int) -> None:
     for name in ('_corners', '_parts'):
         has_room(name, getattr(blade, name), inside, 4)
     has_room('_inside', blade._inside, count)
+    has_room('_spans', blade._spans, inside)
     has_room('_device', blade._device, 2, 3)
     for name in ('_tip', '_edge', '_cut_tip', '_cut_edge', 'force', 'torque'):
         has_room(name, getattr(blade, name), 3)
