@@ -101,6 +101,28 @@ def test_what_shorter_steps_do_not_mend_is_taken_back_with_no_force(
     assert press(tissue, 3) == []
 
 
+def test_a_blade_in_a_tissue_that_diverges_within_a_frame_is_not_asked_where_it_is() -> None:
+    tissue = simulation()
+    asked: list[bool] = []
+
+    class WatchingTool:
+        """A tool without force, in 8 parts of a frame."""
+
+        parts = 8
+
+        def restart(self) -> Coupling:
+            return Coupling()
+
+        def after(self, _share: float, positions: np.ndarray) -> Coupling:
+            asked.append(bool(np.isfinite(positions).all()))
+            return Coupling()
+
+    tissue.dynamics.velocity[:] = 1e308
+    with np.errstate(all='ignore'):
+        assert tissue.dynamics.advance(Coupling(), WatchingTool()).diverged
+    assert all(asked)
+
+
 def test_frames_that_need_shorter_steps_one_after_another_do_not_get_longer_without_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

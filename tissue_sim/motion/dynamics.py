@@ -362,7 +362,10 @@ class Dynamics:
                 self.loads.advance(self._u[:size], dt * steps, near)
             if tool is not None and done >= part * substeps // parts:
                 part += 1
-                coupling = tool.after(done / substeps, self.positions)
+                positions = self.positions
+                if not np.isfinite(positions).all():
+                    break  # a diverged tissue holds no tool: the detector takes the frame back
+                coupling = tool.after(done / substeps, positions)
                 spring = coupling.spring(self.mesh.rest)
         return work
 
