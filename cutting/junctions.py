@@ -25,7 +25,7 @@ def part_junctions(
     earlier: list[Floats],
     h: float,
 ) -> tuple[TopologyDelta, float]:
-    """Part what hangs on where a stroke meets the ends of earlier ones.
+    """Part the tissue that hangs on where a stroke meets the ends of earlier ones.
 
     Args:
         mesh: before the last batch of the stroke.

@@ -19,7 +19,8 @@ _CLEAR = 0.35
 """Height above the surface from which an element is on one side, in edges."""
 _ASIDE = 0.25
 """Distance aside of the surface up to which an element is judged, in edges."""
-_RINGS = 5
+_ADJACENT = 5
+"""Times that the elements beside the region are added to it."""
 
 
 class Surface(NamedTuple):
@@ -63,7 +64,7 @@ def _local(mesh: TetMesh, delta: TopologyDelta, seeds: Ints, line: Floats, h: fl
     links = mesh.links
     nodes = set(seeds[near].tolist())
     found: set[int] = set()
-    for _ in range(_RINGS):
+    for _ in range(_ADJACENT):
         fresh: list[int] = []
         for node in nodes:
             corner = int(links.first_corner[node])

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
+from cutting_trainer.tissue_sim.contact.edge import lag_behind, measure_lengths, resist
 from cutting_trainer.tissue_sim.contact.fracture import (
     BLADE_THICKNESS,
     KNOTS,
     CutStrips,
-    look_ahead,
 )
 from cutting_trainer.tissue_sim.mesh.locate import locate_points
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, tetrahedron_volumes
@@ -80,23 +80,6 @@ class Resistance:
     toughness: float
     friction: float
 
-    def forces(
-        self, piece: np.ndarray, fresh: np.ndarray, edge: np.ndarray, ways: np.ndarray
-    ) -> np.ndarray:
-        """Return the largest force that each piece of the edge transmits [N], shape (p,).
-
-        Args:
-            piece: their lengths [m], shape (p,).
-            fresh: 1 where uncut tissue is ahead, else 0, shape (p,).
-            edge: unit vector along the edge, shape (3,).
-            ways: along which the pieces are pulled, shape (p, 3).
-        """
-        sizes = np.maximum(np.linalg.norm(ways, axis=1), 1e-300)
-        (x, y, z), (a, b, c) = ways.T, edge  # their product, at half the cost of np.cross
-        across = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=1)
-        sines = np.linalg.norm(across, axis=1) / sizes
-        return np.asarray(piece * (fresh * self.toughness * sines + self.friction))
-
 
 class Blade:
     """The blade's edge in the tissue, from entry to exit.
@@ -121,7 +104,7 @@ class Blade:
     ) -> None:
         self._resistance = resistance
         self._device = np.array([root, tip])
-        self._points = self._device_points()
+        self._device_points = self._points = _points_of(self._device)
         self._moved = np.zeros((_SAMPLES, 3))
         self._tip, self._edge = tip.copy(), root - tip
         self._cut_tip, self._cut_edge = tip.copy(), root - tip
@@ -171,7 +154,7 @@ class Blade:
             return
         before = self._points[self._inside]
         carried = np.einsum('ij,ijk->ik', self._parts, positions[self._corners])
-        unit, device = self._direction(), self._device_points()[self._inside]
+        unit, device = self._direction(), self._device_points[self._inside]
         most = self._along(device - before, unit)
         stretch = (device - carried) @ unit
         slid = stretch - np.clip(stretch, -most, most)
@@ -214,17 +197,18 @@ class Blade:
             some = mesh.tetrahedra[:: 1 + len(mesh.tetrahedra) // _MEDIAN_SAMPLES]
             volumes = tetrahedron_volumes(mesh.rest, some)
             self._element = 2 * float(np.cbrt(np.median(volumes)))
-        before = self._device_points()
+        before = self._device_points
         self._device = device.copy()
+        self._device_points = _points_of(device)
         self._grip = self._resistance.friction * self._piece() / (stiffness / _WHOLE)
-        self._moved = self._device_points() - before
+        self._moved = self._device_points - before
         self._points = self._lagging()
         self._immerse(mesh, positions)
         cuts = np.zeros((0, 3, 3))
         if not self._inside.any():
             self._fracture.forget()
         else:
-            ends = np.concatenate([self._points, self._device_points()])[np.tile(self._inside, 2)]
+            ends = np.concatenate([self._points, self._device_points])[np.tile(self._inside, 2)]
             cuts = self._fracture.near(positions[opened], ends)
             for _ in range(_MAX_SLIPS):
                 if not self._slip(stiffness, cuts):
@@ -277,13 +261,9 @@ class Blade:
             limit=self.limit,
         )
 
-    def _device_points(self) -> np.ndarray:
-        root, tip = self._device
-        return np.asarray(tip + _SHARES[:, None] * (root - tip))
-
     def _stretch(self) -> np.ndarray:
         """Return from the edge to the device's edge at each point in the tissue [m], (p, 3)."""
-        return np.asarray((self._device_points() - self._points)[self._inside])
+        return np.asarray((self._device_points - self._points)[self._inside])
 
     def _immerse(self, mesh: TetMesh, positions: np.ndarray) -> None:
         """Find the points in the tissue. Those in the air go with them: the edge is rigid.
@@ -307,19 +287,19 @@ class Blade:
         self._parts = parts[self._inside]
         if len(self._corners):
             self._hint = int(found[self._inside][0])
-        lengths = self._lengths(mesh, positions)
+        piece = (self._device[0] - self._device[1]) / _SAMPLES
+        tets, neighbors = mesh.tetrahedra, mesh.neighbors
+        lengths = measure_lengths(
+            positions, tets, neighbors, self._points, self._inside, piece, _PARTS, self._hint
+        )
         self._spans = lengths[self._inside]
         grown = np.where(self._inside, np.sqrt(before / np.maximum(lengths, 1e-12)), 1.0)
         self._relax(mesh, positions, grown)
 
     def _lagging(self) -> np.ndarray:
         """Return the points, with those in the air as far behind as the nearest in the tissue."""
-        points = self._device_points()
-        if not self._inside.any():
-            return points
-        shares, stretch = _SHARES[self._inside], self._stretch()
-        lag = np.column_stack([np.interp(_SHARES, shares, part) for part in stretch.T])
-        return np.where(self._inside[:, None], self._points, points - lag)
+        points = lag_behind(self._device_points, self._points, self._inside, _SHARES)
+        return np.asarray(points)
 
     def _locate(
         self, mesh: TetMesh, positions: np.ndarray, points: np.ndarray
@@ -331,7 +311,7 @@ class Blade:
 
     def _before_tissue(self, mesh: TetMesh, positions: np.ndarray) -> np.ndarray:
         """Return an edge in the air where it meets tissue on its way to the device's [m]."""
-        device = self._device_points()
+        device = self._device_points
         ways = device - self._points
         longest = float(np.linalg.norm(ways, axis=1).max())
         steps = min(int(np.ceil(longest / (BLADE_THICKNESS / 2))), _MAX_STEPS)
@@ -343,25 +323,6 @@ class Blade:
         meets = (found >= 0).reshape(steps, -1).any(axis=1)
         return np.asarray(on_way[int(meets.argmax())] if meets.any() else device)
 
-    def _lengths(self, mesh: TetMesh, positions: np.ndarray) -> np.ndarray:
-        """Return how much of the edge each point would stand for [pieces], shape (48,).
-
-        At the end of the tissue it is what is left to there, so that the force does not change in
-        steps of a piece as the blade goes in.
-        """
-        inside, lengths = self._inside, np.ones(_SAMPLES)
-        upper = np.flatnonzero(inside[:-1] & ~inside[1:])
-        lower = np.flatnonzero(inside[1:] & ~inside[:-1]) + 1
-        at = np.concatenate([upper, lower])
-        if len(at):
-            step = (self._device[0] - self._device[1]) / _SAMPLES
-            ways = np.concatenate([np.ones(len(upper)), -np.ones(len(lower))])[:, None] * step
-            beyond = self._points[at][:, None] + _PARTS[:, None] * ways[:, None]
-            found, _ = self._locate(mesh, positions, beyond.reshape(-1, 3))
-            reached = np.cumprod(found.reshape(len(at), -1) >= 0, axis=1).mean(axis=1)
-            np.add.at(lengths, at, reached - 0.5)
-        return np.maximum(lengths, _PARTS[0])
-
     def _relax(self, mesh: TetMesh, positions: np.ndarray, grown: np.ndarray) -> None:
         """Spread the energy of points over the edge that has come into the tissue beside them.
 
@@ -369,7 +330,7 @@ class Blade:
             mesh, positions: as for `follow`.
             grown: root of the length that a point stood for over that it stands for now, (48,).
         """
-        stretch = self._device_points() - self._points
+        stretch = self._device_points - self._points
         at = np.flatnonzero((grown < 1) & (np.abs(stretch).max(axis=1) > _SETTLED))
         if not len(at):
             return
@@ -398,13 +359,10 @@ class Blade:
 
     def _slip(self, stiffness: float, cuts: np.ndarray) -> bool:
         """Let the points slip whose springs exceed the resistance; return whether any did."""
-        ways = self._stretch()
-        fresh = np.empty(len(ways))
-        look_ahead(self._points[self._inside], ways, cuts, BLADE_THICKNESS / 2, _AHEAD, fresh)
-        unit, each = self._direction(), stiffness / _WHOLE * self._spans
+        ways, each = self._stretch(), stiffness / _WHOLE * self._spans
         pieces = self._piece() * self._spans
+        fresh, limits = self._resist(ways, cuts, pieces)
         sizes = np.maximum(np.linalg.norm(ways, axis=1), 1e-300)
-        limits = self._resistance.forces(pieces, fresh, unit, ways)
         slid = np.maximum(sizes - limits / each, 0.0)
         slid = np.where(fresh == 0, np.minimum(slid, _MAX_FREE_SLIP), slid)
         if slid.max() < _SETTLED:
@@ -424,6 +382,18 @@ class Blade:
             self._fracture.leave()
         return True
 
+    def _resist(
+        self, ways: np.ndarray, cuts: np.ndarray, pieces: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the results of `resist` for the points in the tissue."""
+        toughness, friction = self._resistance.toughness, self._resistance.friction
+        points, edge = self._points[self._inside], self._direction()
+        reach = BLADE_THICKNESS / 2
+        found: tuple[np.ndarray, np.ndarray] = resist(
+            points, ways, cuts, pieces, edge, toughness, friction, reach, _AHEAD
+        )
+        return found
+
     def _settle(self, stiffness: float, cuts: np.ndarray) -> None:
         """Update the output: force, torque, limit, and the edge as a line."""
         self.force, self.torque, self.limit, self.lag = np.zeros(3), np.zeros(3), 0.0, 0.0
@@ -441,9 +411,7 @@ class Blade:
         self.lag = float(np.linalg.norm(stretch.mean(axis=0)))
         # As it is pulled now, or will be if the device moves on.
         for ways in (stretch.copy(), self._moved[self._inside]):
-            fresh = np.empty(count)
-            look_ahead(self._points[self._inside], ways, cuts, BLADE_THICKNESS / 2, _AHEAD, fresh)
-            limits = self._resistance.forces(pieces, fresh, self._direction(), ways)
+            limits = self._resist(ways, cuts, pieces)[1]
             self.limit = max(self.limit, float(limits.sum()))
         if count < _MIN_POINTS:
             self._tip = self._tip - stretch.mean(axis=0)
@@ -482,6 +450,12 @@ class Blade:
             self._cut_tip, self._cut_edge = self._cut_tip + tip, root - tip
             self._set_back = True
         self._failed = True
+
+
+def _points_of(device: np.ndarray) -> np.ndarray:
+    """Return points of an edge, given by root and tip [m], shape (48, 3)."""
+    root, tip = device
+    return np.asarray(tip + _SHARES[:, None] * (root - tip))
 
 
 def _line(shares: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

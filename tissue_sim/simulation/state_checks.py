@@ -346,6 +346,7 @@ def _check_blade(simulation: TissueSimulation, n: int) -> None:
         return
     count = len(blade._points)
     has_room('_points', blade._points, count, 3)
+    has_room('_device_points', blade._device_points, count, 3)
     within('corners of the blade', blade._corners, n)
     inside = int(np.count_nonzero(blade._inside))
     for name in ('_corners', '_parts'):
