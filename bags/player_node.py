@@ -19,7 +19,8 @@ from cutting_trainer.bags.ros_qos import publisher_qos
 from cutting_trainer.bags.topics import BUTTON, FORCES, OF_DEVICE, OF_TISSUE, POSE, REPLAYED
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
 from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
-from cutting_trainer.node_common.ros import EVENTS, LATCHED, NEWEST_BEST_EFFORT, STREAM, polled
+from cutting_trainer.node_common.qos import EVENTS, LATCHED, NEWEST_BEST_EFFORT, STREAM
+from cutting_trainer.node_common.ros import polled
 from cutting_trainer.node_common.timing import PeriodicLoop
 
 _RATE_HZ = 1000.0

@@ -8,18 +8,15 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from cutting_trainer.bags.qos import OfferedQos
 from cutting_trainer.bags.topics import FORCES
+from cutting_trainer.node_common.qos import EVENTS, LATCHED, STREAM, UPDATES
 from cutting_trainer.node_common.ros import (
     ARM,
     CONTACT,
     DIAGNOSTICS,
-    EVENTS,
     FORCE,
     FRAME_INPUTS,
-    LATCHED,
     MESH,
     MESH_UPDATES,
-    STREAM,
-    UPDATES,
 )
 
 QUEUE_DEPTH = 1000

@@ -86,7 +86,8 @@ def _ends(outgoing: str, incoming: str) -> tuple[Any, Any, Any]:
     import rclpy
     from std_msgs.msg import String
 
-    from cutting_trainer.node_common.ros import EVENTS, polled
+    from cutting_trainer.node_common.qos import EVENTS
+    from cutting_trainer.node_common.ros import polled
 
     rclpy.init()
     node = rclpy.create_node(outgoing)

@@ -14,7 +14,7 @@ from cutting_trainer.cutting.method import FAILURES, CutResult, SweepError, carr
 from cutting_trainer.cutting.methods import make_method
 from cutting_trainer.cutting.settings import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, run
 from cutting_trainer.node_common.parameters import (
@@ -73,11 +73,11 @@ class CuttingNode(ManagedNode):
         self._counts: Counter[str] = Counter()
         self._slowest = 0.0
         most = self._largest
-        ros.listen(self, Mesh, ros.MESH, self._take_mesh, ros.LATCHED, most=most)
+        ros.listen(self, Mesh, ros.MESH, self._take_mesh, qos.LATCHED, most=most)
         self._deltas = ros.listen(
-            self, MeshDelta, ros.MESH_UPDATES, self._take_delta, ros.UPDATES, most=most
+            self, MeshDelta, ros.MESH_UPDATES, self._take_delta, qos.UPDATES, most=most
         )
-        states = self.create_publisher(State, ros.CUTTING_STATE, ros.STREAM)
+        states = self.create_publisher(State, ros.CUTTING_STATE, qos.STREAM)
         self._states = StatePublisher(states)
         self._get_mesh = self.create_client(GetMesh, ros.GET_MESH)
         ros.introspect(self, self.create_service(Cut, ros.CUT, self._serve))

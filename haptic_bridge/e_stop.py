@@ -16,7 +16,7 @@ from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool, Empty
 from std_srvs.srv import Trigger
 
-from cutting_trainer.node_common import output, ros
+from cutting_trainer.node_common import output, qos, ros
 from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.operating_state import E_STOP, OperatingStateMachine
 
@@ -46,15 +46,15 @@ class EStop:
     def __init__(self, node: ManagedNode, machine: OperatingStateMachine, button: int) -> None:
         self.pressed_ns = 0
         self._node, self._machine, self._button = node, machine, button
-        self._topic = ros.polled(node, Empty, ros.E_STOP, ros.EVENTS)
+        self._topic = ros.polled(node, Empty, ros.E_STOP, qos.EVENTS)
         self._joy: Any = None
         if button >= 0:
-            self._joy = ros.polled(node, Joy, f'{ros.ARM}/button', ros.EVENTS)
+            self._joy = ros.polled(node, Joy, f'{ros.ARM}/button', qos.EVENTS)
         self._is_held = False
         self._counted = 0
         self._said = self._is_asked = False
         self._published: bool | None = None
-        self._publisher = node.create_publisher(Bool, 'haptic_bridge/e_stopped', ros.LATCHED)
+        self._publisher = node.create_publisher(Bool, 'haptic_bridge/e_stopped', qos.LATCHED)
         self._service = node.create_service(Trigger, 'haptic_bridge/reset_e_stop', self._reset)
         ros.introspect(node, self._service)
         self._publish_change()

@@ -22,7 +22,7 @@ from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.haptic_bridge.simulation_follower import SimulationFollower
 from cutting_trainer.haptic_bridge.warm_up import warm_up
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     PoseStampedCodec,
@@ -106,11 +106,11 @@ class HapticBridge(ManagedNode):
         self._pose_codec = PoseStampedCodec()
         self._wrench_codec = WrenchStampedCodec(f'{ros.ARM}_base')
         self._contact_codec = ContactCodec(ros.FRAME)
-        self._pose = ros.polled(self, PoseStamped, f'{ros.ARM}/measured_cp', ros.NEWEST_BEST_EFFORT)
+        self._pose = ros.polled(self, PoseStamped, f'{ros.ARM}/measured_cp', qos.NEWEST_BEST_EFFORT)
         self._wrench = self.create_publisher(
-            WrenchStamped, f'{ros.ARM}/{device.force_topic}', ros.STREAM
+            WrenchStamped, f'{ros.ARM}/{device.force_topic}', qos.STREAM
         )
-        self._contact = self.create_publisher(Contact, ros.CONTACT, ros.STREAM)
+        self._contact = self.create_publisher(Contact, ros.CONTACT, qos.STREAM)
         self._senders = PublisherMonitor(self, WATCHED, accepted_publishers(self, device))
         self._follower = SimulationFollower(self, self._machine.fault)
         self._interface = StateInterface(self, 'haptic_bridge', self._machine)

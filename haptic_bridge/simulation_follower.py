@@ -5,7 +5,7 @@ from collections.abc import Callable
 from cutting_trainer_msgs.msg import ForceSample
 
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
 from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.rejections import require_frame
@@ -34,7 +34,7 @@ class SimulationFollower:
         self._codec = ForceSampleCodec()
         self._watch = StreamMonitor(ros.FORCE, queues=True)
         self._late = 0
-        self._force = ros.polled(node, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
+        self._force = ros.polled(node, ForceSample, ros.FORCE, qos.NEWEST_BEST_EFFORT)
 
     @property
     def report(self) -> dict[str, object]:

@@ -16,8 +16,9 @@ from cutting_trainer.node_common.operating_state import (
     crtk_types,
     device_cause,
 )
+from cutting_trainer.node_common.qos import EVENTS, LATCHED
 from cutting_trainer.node_common.rejections import MessageError
-from cutting_trainer.node_common.ros import EVENTS, LATCHED, introspect, listen, stamp
+from cutting_trainer.node_common.ros import introspect, listen, stamp
 
 MAX_STATE_LENGTH = 64
 """Characters in the name of an operating state."""

@@ -1,4 +1,4 @@
-"""Shared parts of all nodes: topic names, QoS, polled subscriptions, diagnostics."""
+"""Shared parts of all nodes: topic names, polled subscriptions, diagnostics."""
 
 import math
 import time
@@ -10,11 +10,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy._rclpy_pybind11 import RMWError
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
 
 from cutting_trainer.node_common import output
+from cutting_trainer.node_common.qos import EVENTS, STREAM
 from cutting_trainer.node_common.rejections import TISSUE_FRAME, MessageError
 from cutting_trainer.node_common.stamps import seconds_and_nanoseconds
 
@@ -38,30 +39,6 @@ E_STOP = 'haptic_bridge/e_stop'
 DIAGNOSTICS = '/diagnostics'
 MARKERS = 'viewer/markers'
 STATIC_FRAMES = '/tf_static'
-
-
-def _reliable(depth: int, *, latched: bool = False) -> QoSProfile:
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=durability,
-    )
-
-
-STREAM = _reliable(500)
-"""Publishers of streams. The queue is deep: a recorder loses nothing in a short pause."""
-NEWEST_BEST_EFFORT = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-)
-"""Subscribers that use only the newest sample; a late one is worthless."""
-LATCHED = _reliable(1, latched=True)
-UPDATES = _reliable(150)
-"""Five seconds of deltas: a link may fail for so long without loss."""
-EVENTS = _reliable(10)
-HISTORY = _reliable(1000, latched=True)
-"""Rare messages that every later subscriber must get, all of them."""
 
 
 DIAGNOSTICS_TIMEOUT_S = 1.5

@@ -25,7 +25,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import Log
 from rclpy.executors import SingleThreadedExecutor
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
@@ -81,20 +81,20 @@ class World:
         self.record = record
         self.node = rclpy.create_node('world')
         make, poll = self.node.create_publisher, ros.polled
-        self.pose = make(PoseStamped, 'arm/measured_cp', ros.STREAM)
-        self.mesh = make(messages.Mesh, ros.MESH, ros.LATCHED)
-        self.updates = make(messages.MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
-        self.force = make(messages.ForceSample, ros.FORCE, ros.STREAM)
+        self.pose = make(PoseStamped, 'arm/measured_cp', qos.STREAM)
+        self.mesh = make(messages.Mesh, ros.MESH, qos.LATCHED)
+        self.updates = make(messages.MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
+        self.force = make(messages.ForceSample, ros.FORCE, qos.STREAM)
         types = crtk_types()
-        self.command = make(types.command, 'haptic_bridge/state_command', ros.EVENTS)
+        self.command = make(types.command, 'haptic_bridge/state_command', qos.EVENTS)
         self.message = types.command
-        self.wrench = poll(self.node, WrenchStamped, 'arm/servo_cf', ros.EVENTS)
-        self.contact = poll(self.node, messages.Contact, ros.CONTACT, ros.EVENTS)
+        self.wrench = poll(self.node, WrenchStamped, 'arm/servo_cf', qos.EVENTS)
+        self.contact = poll(self.node, messages.Contact, ros.CONTACT, qos.EVENTS)
         self.state = poll(
-            self.node, types.operating_state, 'haptic_bridge/operating_state', ros.LATCHED
+            self.node, types.operating_state, 'haptic_bridge/operating_state', qos.LATCHED
         )
-        self.status = poll(self.node, DiagnosticArray, ros.DIAGNOSTICS, ros.EVENTS)
-        self.log = poll(self.node, Log, '/rosout', ros.STREAM)
+        self.status = poll(self.node, DiagnosticArray, ros.DIAGNOSTICS, qos.EVENTS)
+        self.log = poll(self.node, Log, '/rosout', qos.STREAM)
         self.place = (0.0, 0.0)
         self.height = ABOVE
         self.poses = self.simulation = True

@@ -26,7 +26,8 @@ from ruamel.yaml import YAML
 from cutting_trainer.bags.reader import Recorded, open_bag
 from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, WrenchStampedCodec
-from cutting_trainer.node_common.ros import NEWEST_BEST_EFFORT, polled, take_raw
+from cutting_trainer.node_common.qos import NEWEST_BEST_EFFORT
+from cutting_trainer.node_common.ros import polled, take_raw
 from cutting_trainer.session.domain import MAX_DOMAIN, has_participants, reserved_domain
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.graph import MODULES, VIEWER_NODE

@@ -16,11 +16,7 @@ import numpy as np
 from cutting_trainer.session.scene import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.viewer import plots
-from cutting_trainer.viewer.controls import LiveControls, ReplayControls
-from cutting_trainer.viewer.gate import Gate, link
-from cutting_trainer.viewer.page_server import PageServer
-from cutting_trainer.viewer.protocol import AnyMessage, Guide, Record, Scale
-from cutting_trainer.viewer.shapes import (
+from cutting_trainer.viewer.appearance import (
     FLOOR,
     OTHER_TISSUE,
     camera,
@@ -28,6 +24,10 @@ from cutting_trainer.viewer.shapes import (
     shown_tissue,
     tool_shape,
 )
+from cutting_trainer.viewer.controls import LiveControls, ReplayControls
+from cutting_trainer.viewer.gate import Gate, link
+from cutting_trainer.viewer.page_server import PageServer
+from cutting_trainer.viewer.protocol import AnyMessage, Guide, Record, Scale
 from cutting_trainer.viewer.surfaces import CUT, TissueSource
 
 TOKEN = 'stand-in'

@@ -19,7 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from numpy.testing import assert_allclose, assert_array_equal
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import (
     PoseStampedCodec,
     StampedCodec,
@@ -90,17 +90,17 @@ class Bridge:
         self.node = rclpy.create_node('bridge')
         self.types = crtk_types()
         make = self.node.create_publisher
-        self.servo_cf = make(WrenchStamped, 'arm/servo_cf', ros.STREAM)
-        self.command = make(self.types.command, 'arm/state_command', ros.EVENTS)
-        self.state = make(self.types.operating_state, 'haptic_bridge/operating_state', ros.LATCHED)
+        self.servo_cf = make(WrenchStamped, 'arm/servo_cf', qos.STREAM)
+        self.command = make(self.types.command, 'arm/state_command', qos.EVENTS)
+        self.state = make(self.types.operating_state, 'haptic_bridge/operating_state', qos.LATCHED)
         self.query = self.node.create_client(self.types.query, 'arm/operating_state')
         poll = ros.polled
         self.arm_state = poll(
-            self.node, self.types.operating_state, 'arm/operating_state', ros.LATCHED
+            self.node, self.types.operating_state, 'arm/operating_state', qos.LATCHED
         )
-        self.status = poll(self.node, DiagnosticArray, ros.DIAGNOSTICS, ros.EVENTS)
+        self.status = poll(self.node, DiagnosticArray, ros.DIAGNOSTICS, qos.EVENTS)
         self.streams = [
-            (poll(self.node, kind, f'arm/{topic}', ros.EVENTS), codec(), samples)
+            (poll(self.node, kind, f'arm/{topic}', qos.EVENTS), codec(), samples)
             for kind, topic, codec, samples in (
                 (PoseStamped, 'measured_cp', PoseStampedCodec, record.poses),
                 (TwistStamped, 'measured_cv', TwistStampedCodec, record.twists),
@@ -215,7 +215,7 @@ def play(bridge: Bridge, record: Record) -> None:
     time.sleep(0.1)
     bridge.order('enable', 'ENABLED')
     record.mark('two bridges')
-    bridge.second = bridge.node.create_publisher(WrenchStamped, 'arm/servo_cf', ros.STREAM)
+    bridge.second = bridge.node.create_publisher(WrenchStamped, 'arm/servo_cf', qos.STREAM)
     wait_for(lambda: record.states[-1] == 'FAULT', 5.0)
     record.mark('two bridges told')
     time.sleep(0.2)

@@ -21,7 +21,8 @@ from std_msgs.msg import Header
 
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.repair import repair_bag
-from cutting_trainer.node_common.ros import CONTACT, MESH_UPDATES, UPDATES
+from cutting_trainer.node_common.qos import UPDATES
+from cutting_trainer.node_common.ros import CONTACT, MESH_UPDATES
 
 pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 

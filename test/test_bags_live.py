@@ -32,15 +32,8 @@ from std_srvs.srv import SetBool
 from cutting_trainer.bags.node import Recorder
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.repair import repair_bag
-from cutting_trainer.node_common.ros import (
-    CONTACT,
-    FRAME_INPUTS,
-    LATCHED,
-    MESH_UPDATES,
-    STREAM,
-    TISSUE_STATE,
-    UPDATES,
-)
+from cutting_trainer.node_common.qos import LATCHED, STREAM, UPDATES
+from cutting_trainer.node_common.ros import CONTACT, FRAME_INPUTS, MESH_UPDATES, TISSUE_STATE
 from cutting_trainer.session.scene import find_scene
 
 pytestmark = pytest.mark.real_time

@@ -16,7 +16,7 @@ from bridge_world import DEPTH, PRESSED, SCHEDULING, K, Record, World, refused, 
 
 from cutting_trainer.haptic_bridge.chain import NONE
 from cutting_trainer.haptic_bridge.settings import DeviceSettings
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec
 
 pytestmark = pytest.mark.real_time
@@ -215,7 +215,7 @@ def play(world: FaultyWorld, record: Record) -> None:
         world.lift()
         end(fault)
     begin('device disabled')
-    device = world.node.create_publisher(world.state.msg_type, 'arm/operating_state', ros.LATCHED)
+    device = world.node.create_publisher(world.state.msg_type, 'arm/operating_state', qos.LATCHED)
     device.publish(world.state.msg_type(state='DISABLED', is_homed=True))
     world.wait_for('FAULT', 2.0)
     time.sleep(0.2)
@@ -228,7 +228,7 @@ def play(world: FaultyWorld, record: Record) -> None:
     end('device disabled')
     for fault, publisher in zip(TWO, (world.pose, world.force), strict=True):
         world.press()
-        world.second = world.node.create_publisher(publisher.msg_type, publisher.topic, ros.STREAM)
+        world.second = world.node.create_publisher(publisher.msg_type, publisher.topic, qos.STREAM)
         begin(fault)
         world.wait_for('FAULT', 5.0)
         time.sleep(0.2)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import Joy
 
 from cutting_trainer.haptic_bridge.settings import DeviceSettings
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec, StampedCodec
 
 pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
@@ -46,8 +46,8 @@ class HostileWorld(World):
         self.hostile: deque = deque()
         super().__init__(record)
         make = self.node.create_publisher
-        self.button = make(Joy, 'arm/button', ros.EVENTS)
-        self.device = make(self.state.msg_type, 'arm/operating_state', ros.LATCHED)
+        self.button = make(Joy, 'arm/button', qos.EVENTS)
+        self.device = make(self.state.msg_type, 'arm/operating_state', qos.LATCHED)
 
     def send_pose(self, now: int, tick: int) -> None:
         while self.hostile:

@@ -19,7 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from cutting_trainer.bags.frames import read_frames
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate import recomputation
 from cutting_trainer.session.graph import node_environment
@@ -62,9 +62,9 @@ class Between:
         self.inputs: list[FrameInputs] = []
         self.newest = 0.0
         self.forces: dict[int, ForceSample] = {}
-        self.contacts = self.node.create_publisher(Contact, ros.CONTACT, ros.STREAM)
-        self.node.create_subscription(FrameInputs, ros.FRAME_INPUTS, self._note, ros.STREAM)
-        self.node.create_subscription(ForceSample, ros.FORCE, self._keep, ros.STREAM)
+        self.contacts = self.node.create_publisher(Contact, ros.CONTACT, qos.STREAM)
+        self.node.create_subscription(FrameInputs, ros.FRAME_INPUTS, self._note, qos.STREAM)
+        self.node.create_subscription(ForceSample, ros.FORCE, self._keep, qos.STREAM)
 
     def _note(self, inputs: FrameInputs) -> None:
         self.newest = time.monotonic()

@@ -21,7 +21,7 @@ from meshes import box
 from rclpy.executors import SingleThreadedExecutor
 
 from cutting_trainer.cutting.checks import check_mesh, pieces
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.session.graph import node_environment
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, delta_from, mesh_message
@@ -43,8 +43,8 @@ class Tissue:
         self.step = 0
         self.node = rclpy.create_node('tissue', context=context)
         self._encoder = DeltaEncoder(self.mesh, self.displacement)
-        self._keyframes = self.node.create_publisher(Mesh, ros.MESH, ros.LATCHED)
-        self._updates = self.node.create_publisher(MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
+        self._keyframes = self.node.create_publisher(Mesh, ros.MESH, qos.LATCHED)
+        self._updates = self.node.create_publisher(MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
         self._service = self.node.create_service(GetMesh, ros.GET_MESH, self._serve)
         self._client = self.node.create_client(Cut, ros.CUT)
         self._keyframes.publish(self._message())

@@ -23,7 +23,7 @@ from std_msgs.msg import Bool, Empty
 from std_srvs.srv import Trigger
 
 from bench.flood import OFFERED_WORDS_PER_S, Flood
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.graph import BRIDGE_NODE, node_command, node_environment
 from cutting_trainer.session.supervisor import Event, Supervisor
@@ -48,11 +48,11 @@ class StoppedWorld(World):
         self.e_stopped: list[bool] = []
         super().__init__(record)
         self.place = (0.01, -0.01)
-        self.press_topic = self.node.create_publisher(Empty, ros.E_STOP, ros.EVENTS)
-        self.button = self.node.create_publisher(Joy, 'arm/button', ros.EVENTS)
+        self.press_topic = self.node.create_publisher(Empty, ros.E_STOP, qos.EVENTS)
+        self.button = self.node.create_publisher(Joy, 'arm/button', qos.EVENTS)
         self.client = self.node.create_client(Trigger, 'haptic_bridge/reset_e_stop')
         self.node.create_subscription(
-            Bool, 'haptic_bridge/e_stopped', lambda m: self.e_stopped.append(m.data), ros.LATCHED
+            Bool, 'haptic_bridge/e_stopped', lambda m: self.e_stopped.append(m.data), qos.LATCHED
         )
 
     def say(self, word: str) -> None:

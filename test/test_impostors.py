@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 
 from cutting_trainer.haptic_bridge.chain import INSIDE
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec
 
 pytestmark = pytest.mark.real_time
@@ -39,7 +39,7 @@ def play(world: World, record: Record) -> None:
     ):
         thief = Node(f'{name}_thief')
         record.marks[name] = time.time_ns()
-        publisher: Any = thief.create_publisher(kind, topic, ros.STREAM)
+        publisher: Any = thief.create_publisher(kind, topic, qos.STREAM)
         world.wait_for('FAULT', 5.0)
         record.marks[f'{name} found'] = time.time_ns()
         if name == 'slow':

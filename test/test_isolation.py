@@ -28,7 +28,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from cutting_trainer.node_common.operating_state import crtk_types
-from cutting_trainer.node_common.ros import EVENTS, LATCHED, NEWEST_BEST_EFFORT
+from cutting_trainer.node_common.qos import EVENTS, LATCHED, NEWEST_BEST_EFFORT
 from cutting_trainer.node_common.ros import polled, take, take_raw
 rclpy.init()
 node, types = Node('stranger'), crtk_types()

@@ -18,7 +18,8 @@ from live import PATIENCE, ROOT, free_domain, two_presses, wait_for, write_scene
 from rclpy.node import Node
 
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
-from cutting_trainer.node_common.ros import NEWEST_BEST_EFFORT, polled, take_raw
+from cutting_trainer.node_common.qos import NEWEST_BEST_EFFORT
+from cutting_trainer.node_common.ros import polled, take_raw
 from cutting_trainer.session.graph import MODULES, node_environment
 
 pytestmark = pytest.mark.long

@@ -12,7 +12,7 @@ from live import free_domain, wait_for
 from meshes import irregular_box
 from rclpy.node import Node
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.rejections import RejectionStatistics
 from cutting_trainer.node_common.ros import stamp
 from cutting_trainer.node_common.stamps import REVISION_MODULUS, nanoseconds, newer
@@ -62,8 +62,8 @@ class Graph:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=free_domain())
         self.node = Node('graph', context=self.context)
-        self.meshes = self.node.create_publisher(Mesh, ros.MESH, ros.LATCHED)
-        self.updates = self.node.create_publisher(MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
+        self.meshes = self.node.create_publisher(Mesh, ros.MESH, qos.LATCHED)
+        self.updates = self.node.create_publisher(MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
         self.rejections = RejectionStatistics()
         self.follower = MeshFollower(self.node, self.rejections)
         wait_for(lambda: self.updates.get_subscription_count() == 1, 'the follower')

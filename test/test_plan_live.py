@@ -20,7 +20,7 @@ from std_msgs.msg import Header
 
 from cutting_trainer.bags.comparison import compare
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.recordings.html_report import write_report
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate import pose_check, recomputation
@@ -60,10 +60,10 @@ class Surroundings:
     def __init__(self, context: rclpy.Context, scene: Path) -> None:
         self.mesh = make_task(load_scene(str(scene)).tissue).mesh
         self.node = rclpy.create_node('surroundings', context=context)
-        self._contacts = self.node.create_publisher(Contact, ros.CONTACT, ros.STREAM)
+        self._contacts = self.node.create_publisher(Contact, ros.CONTACT, qos.STREAM)
         self.node.create_service(Cut, ros.CUT, self._cut)
         self.node.create_subscription(
-            DiagnosticArray, ros.DIAGNOSTICS, self._take_status, ros.EVENTS
+            DiagnosticArray, ros.DIAGNOSTICS, self._take_status, qos.EVENTS
         )
         self._timer = self.node.create_timer(0.02, self._press)
         self.pressing = False

@@ -12,7 +12,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from cutting_trainer.cli import main as cli
 from cutting_trainer.haptic_bridge.devices import probe_node
-from cutting_trainer.node_common.ros import STREAM, polled, take
+from cutting_trainer.node_common.qos import STREAM
+from cutting_trainer.node_common.ros import polled, take
 from cutting_trainer.session import probe as command
 from cutting_trainer.session.probe import Emulation, ProbeOptions, run_probe
 from cutting_trainer.session.status import Status

@@ -47,7 +47,7 @@ from cutting_trainer.bags.topics import (
     SERVO_CF,
     UPDATES,
 )
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.recordings.replay import _Over, handle_keys, replay_nodes
 from cutting_trainer.session.domain import reserved_domain
@@ -57,12 +57,12 @@ from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 SUBSCRIBERS = {
-    MESH: ros.LATCHED,
-    UPDATES: ros.UPDATES,
-    FORCE: ros.STREAM,
-    CONTACT: ros.NEWEST_BEST_EFFORT,
-    POSE: ros.NEWEST_BEST_EFFORT,
-    SERVO_CF: ros.NEWEST_BEST_EFFORT,
+    MESH: qos.LATCHED,
+    UPDATES: qos.UPDATES,
+    FORCE: qos.STREAM,
+    CONTACT: qos.NEWEST_BEST_EFFORT,
+    POSE: qos.NEWEST_BEST_EFFORT,
+    SERVO_CF: qos.NEWEST_BEST_EFFORT,
 }
 """What our own nodes ask for."""
 
@@ -246,9 +246,9 @@ def test_the_hand_goes_once_the_bridge_is_enabled_and_presses_its_button_again(
     player = hand_player(context, playhead, pressed)
     node = rclpy.create_node('bridge', context=context)
     states = node.create_publisher(
-        crtk_types().operating_state, '/haptic_bridge/operating_state', ros.LATCHED
+        crtk_types().operating_state, '/haptic_bridge/operating_state', qos.LATCHED
     )
-    presses = ros.polled(node, Joy, f'{REPLAYED}{BUTTON}', ros.EVENTS)
+    presses = ros.polled(node, Joy, f'{REPLAYED}{BUTTON}', qos.EVENTS)
     heard: list[int] = []
 
     def hear() -> None:
@@ -282,7 +282,7 @@ def test_a_bridge_that_was_enabled_too_shortly_to_be_heard_ends_the_replay(
     player = hand_player(context, playhead, open_bag(SAMPLE))
     node = rclpy.create_node('bridge', context=context)
     state = crtk_types().operating_state
-    states = node.create_publisher(state, '/haptic_bridge/operating_state', ros.LATCHED)
+    states = node.create_publisher(state, '/haptic_bridge/operating_state', qos.LATCHED)
     try:
         states.publish(state(state='FAULT'))  # a latched topic keeps the newest: ENABLED is gone
         player.start()
@@ -314,10 +314,10 @@ def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
 ) -> None:
     bag = open_bag(SAMPLE)
     node = rclpy.create_node('onlooker', context=context)
-    topics = ((Mesh, MESH, ros.LATCHED), (MeshDelta, UPDATES, ros.UPDATES))
+    topics = ((Mesh, MESH, qos.LATCHED), (MeshDelta, UPDATES, qos.UPDATES))
     mesh, deltas = (ros.polled(node, *topic) for topic in topics)
-    forces = ros.polled(node, ForceSample, FORCE, ros.STREAM)
-    wrenches = ros.polled(node, WrenchStamped, SERVO_CF, ros.NEWEST_BEST_EFFORT)
+    forces = ros.polled(node, ForceSample, FORCE, qos.STREAM)
+    wrenches = ros.polled(node, WrenchStamped, SERVO_CF, qos.NEWEST_BEST_EFFORT)
     playhead = Playhead(0.0, duration(bag), rate=4.0)
     player = SessionPlayer(context, playhead, bag, 0.0, drive_device=False)
     replica, heard = MeshReplica(), 0
@@ -338,7 +338,7 @@ def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
             assert ros.take_raw(wrenches) is None
             time.sleep(0.002)
         assert playhead.over and heard > 20 and replica.step > 100
-        intruder = node.create_publisher(ForceSample, FORCE, ros.STREAM)
+        intruder = node.create_publisher(ForceSample, FORCE, qos.STREAM)
         deadline = time.monotonic() + 10.0
         while not player.stop_reason and time.monotonic() < deadline:
             time.sleep(0.05)
@@ -352,7 +352,7 @@ def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
 @pytest.mark.long
 def test_a_replay_into_a_live_graph_is_refused_in_one_line(context: rclpy.Context) -> None:
     node = rclpy.create_node('live_arm', context=context)
-    node.create_publisher(ForceSample, FORCE, ros.STREAM)
+    node.create_publisher(ForceSample, FORCE, qos.STREAM)
     player = SessionPlayer(context, Playhead(0.0, 1.0), open_bag(SAMPLE), 0.0, drive_device=False)
     try:
         player.reject_live_input(player.topics)

@@ -15,7 +15,7 @@ from cutting_trainer_msgs.msg import Contact, ForceSample, FrameInputs
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from live import free_domain, two_presses, wait_for, write_scene
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.session.graph import node_environment
 from cutting_trainer.session.scene import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
@@ -37,9 +37,9 @@ class Tool:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self._node = rclpy.create_node('tool', context=self._context)
-        self._contacts = self._node.create_publisher(Contact, ros.CONTACT, ros.STREAM)
-        self._forces = ros.polled(self._node, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
-        self._status = ros.polled(self._node, DiagnosticArray, ros.DIAGNOSTICS, ros.EVENTS)
+        self._contacts = self._node.create_publisher(Contact, ros.CONTACT, qos.STREAM)
+        self._forces = ros.polled(self._node, ForceSample, ros.FORCE, qos.NEWEST_BEST_EFFORT)
+        self._status = ros.polled(self._node, DiagnosticArray, ros.DIAGNOSTICS, qos.EVENTS)
         self.sequence = 0
 
     def at(self, depth: float, stiffness: float = 200.0) -> Any:
@@ -121,7 +121,7 @@ def test_a_recorder_that_takes_a_moment_to_find_the_node_has_its_first_frame(
             topic = f'/{ros.FRAME_INPUTS}'
             wait_for(lambda: topic in dict(node.get_topic_names_and_types()), topic)
             time.sleep(0.2)
-            inputs = ros.polled(node, FrameInputs, ros.FRAME_INPUTS, ros.STREAM)
+            inputs = ros.polled(node, FrameInputs, ros.FRAME_INPUTS, qos.STREAM)
             first = wait_for(lambda: ros.take(inputs), 'a frame')
     finally:
         node.destroy_node()

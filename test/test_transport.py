@@ -26,7 +26,7 @@ TALK = """
 import os, sys, time
 import rclpy
 from std_msgs.msg import Header
-from cutting_trainer.node_common.ros import STREAM
+from cutting_trainer.node_common.qos import STREAM
 
 role = sys.argv[1]
 rclpy.init()

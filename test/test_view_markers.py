@@ -17,14 +17,15 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from cutting_trainer.haptic_bridge.chain import TOUCHING
 from cutting_trainer.haptic_bridge.settings import DeviceSettings, ToolSettings, Vector
-from cutting_trainer.node_common.ros import LATCHED, STATIC_FRAMES
+from cutting_trainer.node_common.qos import LATCHED
+from cutting_trainer.node_common.ros import STATIC_FRAMES
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.streaming.messages import mesh_message
 from cutting_trainer.viewer import frames
+from cutting_trainer.viewer.appearance import METRES_PER_NEWTON, OPENED, blade, handle
 from cutting_trainer.viewer.frames import StaticFrames, device_frame, publishing_command
 from cutting_trainer.viewer.markers import Colouring, Markers, shades, von_mises
 from cutting_trainer.viewer.moment import Moment
-from cutting_trainer.viewer.shapes import METRES_PER_NEWTON, OPENED, blade, handle
 
 LARGEST = 0.004
 STAMP = 12_000_000_034

@@ -24,16 +24,8 @@ from std_srvs.srv import Trigger
 from bench.page.open_page import OpenPage
 from bench.page.stand_in import sheet
 from cutting_trainer.node_common.operating_state import crtk_types
-from cutting_trainer.node_common.ros import (
-    ARM,
-    DIAGNOSTICS,
-    EVENTS,
-    FRAME,
-    HAND,
-    LATCHED,
-    MESH,
-    Diagnostics,
-)
+from cutting_trainer.node_common.qos import EVENTS, LATCHED
+from cutting_trainer.node_common.ros import ARM, DIAGNOSTICS, FRAME, HAND, MESH, Diagnostics
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.graph import BRIDGE_NODE, LOCAL, node_environment, viewer_command
 from cutting_trainer.session.node_process import parse_message

@@ -15,7 +15,7 @@ from cutting_trainer_msgs.msg import (
 from cutting_trainer_msgs.srv import GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.code_identity import identity_here
 from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
 from cutting_trainer.node_common.parameters import (
@@ -74,7 +74,7 @@ class TissueSimNode(ManagedNode):
         self._resumes = bool(parameter(self, 'resume', False, text))
         settings = read_section(scene, 'tissue', TissueSettings)
         # First, so that a recorder discovers it while the tissue is set up.
-        self._inputs = self.create_publisher(FrameInputs, ros.FRAME_INPUTS, ros.STREAM)
+        self._inputs = self.create_publisher(FrameInputs, ros.FRAME_INPUTS, qos.STREAM)
         self._announced = time.monotonic()
         self._scene = scene.stem
         text = 'checkpoint file of the tissue, for a replacement of this node'
@@ -135,14 +135,14 @@ class TissueSimNode(ManagedNode):
             announced(self, name, text, 'code, library or processor that computes the tissue')
 
     def _connect(self) -> None:
-        self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, ros.LATCHED)
-        self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
-        self._forces = self.create_publisher(ForceSample, ros.FORCE, ros.STREAM)
-        self._free_pieces = self.create_publisher(FreePiece, ros.PIECES, ros.HISTORY)
-        self._contacts = ros.polled(self, Contact, ros.CONTACT, ros.NEWEST_BEST_EFFORT)
+        self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, qos.LATCHED)
+        self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
+        self._forces = self.create_publisher(ForceSample, ros.FORCE, qos.STREAM)
+        self._free_pieces = self.create_publisher(FreePiece, ros.PIECES, qos.HISTORY)
+        self._contacts = ros.polled(self, Contact, ros.CONTACT, qos.NEWEST_BEST_EFFORT)
         self._touching = PublisherMonitor(self, [ros.CONTACT])
         self._cuts = CutClient(self, self._simulation, self.rejections)
-        states = self.create_publisher(State, ros.TISSUE_STATE, ros.STREAM)
+        states = self.create_publisher(State, ros.TISSUE_STATE, qos.STREAM)
         self._states = StatePublisher(states)
         service = self.create_service(GetMesh, ros.GET_MESH, self._serve_mesh)
         ros.introspect(self, service, contents=False)  # the bag has whole meshes anyway

@@ -7,7 +7,8 @@ from rclpy.node import Node
 
 from cutting_trainer.haptic_bridge.settings import DeviceSettings
 from cutting_trainer.node_common.orientation import quaternion
-from cutting_trainer.node_common.ros import ARM, FRAME, LATCHED, STATIC_FRAMES, stamp
+from cutting_trainer.node_common.qos import LATCHED
+from cutting_trainer.node_common.ros import ARM, FRAME, STATIC_FRAMES, stamp
 
 try:
     from tf2_msgs.msg import TFMessage

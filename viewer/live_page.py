@@ -13,12 +13,7 @@ from cutting_trainer.haptic_bridge.settings import ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.viewer import plots
-from cutting_trainer.viewer.controls import LiveControls
-from cutting_trainer.viewer.history import History
-from cutting_trainer.viewer.moment import Moment
-from cutting_trainer.viewer.page_server import PageServer
-from cutting_trainer.viewer.protocol import MAX_NAME, VERSION
-from cutting_trainer.viewer.shapes import (
+from cutting_trainer.viewer.appearance import (
     FLOOR,
     METRES_PER_NEWTON,
     camera,
@@ -26,6 +21,11 @@ from cutting_trainer.viewer.shapes import (
     shown_tissue,
     tool_shape,
 )
+from cutting_trainer.viewer.controls import LiveControls
+from cutting_trainer.viewer.history import History
+from cutting_trainer.viewer.moment import Moment
+from cutting_trainer.viewer.page_server import PageServer
+from cutting_trainer.viewer.protocol import MAX_NAME, VERSION
 from cutting_trainer.viewer.surfaces import TissueSource
 
 TITLE = 'Cutting trainer'

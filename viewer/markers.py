@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.viewer.appearance import OPENED, arrow
 from cutting_trainer.viewer.moment import Floats, Moment
-from cutting_trainer.viewer.shapes import OPENED, arrow
 
 Colouring = Literal['displacement', 'von_mises']
 ARROW, SPHERE, LINE_LIST, TRIANGLE_LIST = 0, 2, 5, 11

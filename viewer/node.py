@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from visualization_msgs.msg import MarkerArray
 
 from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ContactCodec, PoseStampedCodec, WrenchStampedCodec
 from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
 from cutting_trainer.node_common.operating_state import CrtkState
@@ -95,13 +95,13 @@ class ViewerNode(ManagedNode):
         self._wrench = Stream(self, WrenchStamped, self._force_topic, WrenchStampedCodec())
         self._pose = Stream(self, PoseStamped, f'{ros.ARM}/measured_cp', PoseStampedCodec())
         self._reactions = StreamRate()
-        self._samples = ros.polled(self, ForceSample, ros.FORCE, ros.NEWEST_BEST_EFFORT)
-        self._marker_array = self.create_publisher(MarkerArray, ros.MARKERS, ros.EVENTS)
+        self._samples = ros.polled(self, ForceSample, ros.FORCE, qos.NEWEST_BEST_EFFORT)
+        self._marker_array = self.create_publisher(MarkerArray, ros.MARKERS, qos.EVENTS)
         text = 'publish the frames of the device on /tf_static; false: another node owns them'
         publish = bool(parameter(self, 'publish_frames', True, text))
         self._frames = StaticFrames(self, self._device, publish=publish)
         self._statuses = Statuses(self.get_namespace())
-        ros.listen(self, DiagnosticArray, ros.DIAGNOSTICS, self._statuses.take, ros.EVENTS)
+        ros.listen(self, DiagnosticArray, ros.DIAGNOSTICS, self._statuses.take, qos.EVENTS)
         # Calls from other threads for the one that updates the page, at its next iteration.
         self._asked = Requests()
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()

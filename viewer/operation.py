@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Empty
 from std_srvs.srv import Trigger
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
 from cutting_trainer.viewer.protocol import Guide
@@ -45,16 +45,16 @@ class Operation:
         types = crtk_types()
         self._command = types.command
         bridge_command, arm_command = (f'{name}/state_command' for name in (BRIDGE, ros.ARM))
-        self._to_bridge = node.create_publisher(types.command, bridge_command, ros.EVENTS)
-        self._to_arm = node.create_publisher(types.command, arm_command, ros.EVENTS)
-        self._stop = node.create_publisher(Empty, f'{BRIDGE}/e_stop', ros.EVENTS)
-        self._goal = node.create_publisher(PoseStamped, ros.HAND, ros.EVENTS)
+        self._to_bridge = node.create_publisher(types.command, bridge_command, qos.EVENTS)
+        self._to_arm = node.create_publisher(types.command, arm_command, qos.EVENTS)
+        self._stop = node.create_publisher(Empty, f'{BRIDGE}/e_stop', qos.EVENTS)
+        self._goal = node.create_publisher(PoseStamped, ros.HAND, qos.EVENTS)
         self._setter = node.create_client(SetParameters, f'{BRIDGE}/set_parameters')
         self._resetter = node.create_client(Trigger, f'{BRIDGE}/reset_e_stop')
         for name, take in ((BRIDGE, self._bridge_says), (ros.ARM, self._arm_says)):
             topic = f'{name}/operating_state'
-            ros.listen(node, types.operating_state, topic, take, ros.LATCHED)
-        ros.listen(node, Bool, f'{BRIDGE}/e_stopped', self._stop_says, ros.LATCHED)
+            ros.listen(node, types.operating_state, topic, take, qos.LATCHED)
+        ros.listen(node, Bool, f'{BRIDGE}/e_stopped', self._stop_says, qos.LATCHED)
 
     @property
     def can_guide(self) -> bool:

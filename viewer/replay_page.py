@@ -10,14 +10,7 @@ from cutting_trainer.bags.player import Playhead, duration
 from cutting_trainer.bags.reader import Bag
 from cutting_trainer.haptic_bridge.settings import DeviceSettings, ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
-from cutting_trainer.viewer.controls import ReplayControls
-from cutting_trainer.viewer.gate import Gate
-from cutting_trainer.viewer.live_page import put_moment
-from cutting_trainer.viewer.moment import Floats, Translator
-from cutting_trainer.viewer.page_server import PageServer
-from cutting_trainer.viewer.plots import BLUE, DEPTH, FORCE, ORANGE, Plot
-from cutting_trainer.viewer.protocol import VERSION, AnyMessage, Play, Seek, Speed
-from cutting_trainer.viewer.shapes import (
+from cutting_trainer.viewer.appearance import (
     FLOOR,
     METRES_PER_NEWTON,
     OTHER_TISSUE,
@@ -26,6 +19,13 @@ from cutting_trainer.viewer.shapes import (
     shown_tissue,
     tool_shape,
 )
+from cutting_trainer.viewer.controls import ReplayControls
+from cutting_trainer.viewer.gate import Gate
+from cutting_trainer.viewer.live_page import put_moment
+from cutting_trainer.viewer.moment import Floats, Translator
+from cutting_trainer.viewer.page_server import PageServer
+from cutting_trainer.viewer.plots import BLUE, DEPTH, FORCE, ORANGE, Plot
+from cutting_trainer.viewer.protocol import VERSION, AnyMessage, Play, Seek, Speed
 from cutting_trainer.viewer.surfaces import TissueSource
 from cutting_trainer.viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
 from cutting_trainer.viewer.waiting import Requests

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import StampedCodec
 from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.rejections import MessageError
@@ -24,7 +24,7 @@ class Stream:
         self.newest: Any = None
         self.counter = StreamRate()
         self._codec, self._topic, self._rejections = codec, topic, node.rejections
-        self._subscription = ros.polled(node, message_type, topic, ros.NEWEST_BEST_EFFORT)
+        self._subscription = ros.polled(node, message_type, topic, qos.NEWEST_BEST_EFFORT)
 
     def poll(self, now: float) -> None:
         """Take the messages that have arrived by a time [s]."""

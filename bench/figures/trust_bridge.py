@@ -26,7 +26,7 @@ from cutting_trainer.haptic_bridge.settings import (
     HapticsSettings,
     ToolSettings,
 )
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
@@ -132,22 +132,22 @@ class _World:
 
         self.node, self.over = node, False
         make, types = node.create_publisher, crtk_types()
-        self._poses = make(PoseStamped, f'{ros.ARM}/measured_cp', ros.STREAM)
-        self._forces = make(ForceSample, ros.FORCE, ros.STREAM)
-        self._meshes = make(Mesh, ros.MESH, ros.LATCHED)
+        self._poses = make(PoseStamped, f'{ros.ARM}/measured_cp', qos.STREAM)
+        self._forces = make(ForceSample, ros.FORCE, qos.STREAM)
+        self._meshes = make(Mesh, ros.MESH, qos.LATCHED)
         self._meshes.publish(_mesh(Mesh))
         self.word, self.empty = types.command, Empty
-        self._commands = make(self.word, COMMAND_TOPIC, ros.EVENTS)
-        self._presses = make(Empty, ros.E_STOP, ros.EVENTS)
+        self._commands = make(self.word, COMMAND_TOPIC, qos.EVENTS)
+        self._presses = make(Empty, ros.E_STOP, qos.EVENTS)
         self._trigger = Trigger
         self._reset = node.create_client(Trigger, 'haptic_bridge/reset_e_stop')
-        self._wrench = ros.polled(node, WrenchStamped, f'{ros.ARM}/servo_cf', ros.EVENTS)
-        self._contact = ros.polled(node, _contact_type(), ros.CONTACT, ros.EVENTS)
+        self._wrench = ros.polled(node, WrenchStamped, f'{ros.ARM}/servo_cf', qos.EVENTS)
+        self._contact = ros.polled(node, _contact_type(), ros.CONTACT, qos.EVENTS)
         self.wrenches: list[tuple[int, float]] = []
         self.state, self.stopped = '', False
         hear = node.create_subscription
-        hear(types.operating_state, 'haptic_bridge/operating_state', self._hear, ros.LATCHED)
-        hear(Bool, 'haptic_bridge/e_stopped', self._hear_stop, ros.LATCHED)
+        hear(types.operating_state, 'haptic_bridge/operating_state', self._hear, qos.LATCHED)
+        hear(Bool, 'haptic_bridge/e_stopped', self._hear_stop, qos.LATCHED)
         self._player = threading.Thread(target=self._play)
         self._player.start()
 

@@ -19,7 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from bench.figures.figure import Figure
 from cutting_trainer.node_common.operating_state import E_STOP, CrtkState, crtk_types
-from cutting_trainer.node_common.ros import EVENTS
+from cutting_trainer.node_common.qos import EVENTS
 from cutting_trainer.node_common.share import share_folder
 from cutting_trainer.node_common.timing import MAX_TIMELY_LATENESS_S
 from cutting_trainer.session.domain import reserved_domain

@@ -28,15 +28,9 @@ from rclpy.node import Node
 
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
+from cutting_trainer.node_common.qos import NEWEST_BEST_EFFORT, STREAM, UPDATES
 from cutting_trainer.node_common.realtime import prepare
-from cutting_trainer.node_common.ros import (
-    MESH_UPDATES,
-    NEWEST_BEST_EFFORT,
-    STREAM,
-    UPDATES,
-    polled,
-    take_raw,
-)
+from cutting_trainer.node_common.ros import MESH_UPDATES, polled, take_raw
 from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.graph import node_environment, recorder_command

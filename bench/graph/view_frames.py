@@ -30,7 +30,8 @@ from bench.graph.view_load import (
 )
 from bench.page.open_page import OpenPage, OtherProcess
 from bench.page.stand_in import resident, sheet
-from cutting_trainer.node_common.ros import FRAME, LATCHED, MESH, MESH_UPDATES, UPDATES
+from cutting_trainer.node_common.qos import LATCHED, UPDATES
+from cutting_trainer.node_common.ros import FRAME, MESH, MESH_UPDATES
 from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.graph import LOCAL, node_environment, viewer_command

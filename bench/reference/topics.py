@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.share import PACKAGES
 
 FILE = PACKAGES / 'docs' / 'topics.md'
@@ -22,7 +22,7 @@ class Topic(NamedTuple):
     Attributes:
         name: as the nodes give it; relative, so that a namespace goes before it.
         type: in full.
-        qos: that it is offered with; a profile of `cutting_trainer.node_common.ros`.
+        qos: that it is offered with; a profile of `cutting_trainer.node_common.qos`.
         by: who publishes it.
         when: how often.
         content: content of its messages, with units where the message is not ours.
@@ -43,21 +43,21 @@ DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 BRIDGE, TISSUE = 'haptic_bridge', 'tissue_sim'
 
 TOPICS = (
-    Topic('arm/measured_cp', POSE, ros.STREAM, 'arm', '1 kHz', 'pose of the tool [m]'),
-    Topic('arm/measured_cv', TWIST, ros.STREAM, 'arm', '1 kHz', 'its velocity [m/s]'),
+    Topic('arm/measured_cp', POSE, qos.STREAM, 'arm', '1 kHz', 'pose of the tool [m]'),
+    Topic('arm/measured_cv', TWIST, qos.STREAM, 'arm', '1 kHz', 'its velocity [m/s]'),
     Topic(
         'arm/measured_cf',
         WRENCH,
-        ros.STREAM,
+        qos.STREAM,
         'arm',
         '1 kHz',
         'force it applies [N]; not needed',
     ),
-    Topic('arm/button', JOY, ros.EVENTS, 'arm', 'on event', 'buttons[0]: 1 pressed'),
+    Topic('arm/button', JOY, qos.EVENTS, 'arm', 'on event', 'buttons[0]: 1 pressed'),
     Topic(
         'arm/servo_cf',
         WRENCH,
-        ros.STREAM,
+        qos.STREAM,
         BRIDGE,
         '1 kHz',
         "force on the operator's hand [N]",
@@ -65,7 +65,7 @@ TOPICS = (
     Topic(
         ros.CONTACT,
         f'{OURS}/msg/Contact',
-        ros.STREAM,
+        qos.STREAM,
         BRIDGE,
         '1 kHz',
         'where the tool is',
@@ -73,7 +73,7 @@ TOPICS = (
     Topic(
         ros.FORCE,
         f'{OURS}/msg/ForceSample',
-        ros.STREAM,
+        qos.STREAM,
         TISSUE,
         '30 Hz',
         'the reaction on it',
@@ -81,7 +81,7 @@ TOPICS = (
     Topic(
         ros.FRAME_INPUTS,
         f'{OURS}/msg/FrameInputs',
-        ros.STREAM,
+        qos.STREAM,
         TISSUE,
         '30 Hz',
         'the inputs of the frame',
@@ -89,7 +89,7 @@ TOPICS = (
     Topic(
         ros.TISSUE_STATE,
         f'{OURS}/msg/State',
-        ros.STREAM,
+        qos.STREAM,
         TISSUE,
         'when somebody begins to listen',
         'all that the frames to come depend on',
@@ -97,7 +97,7 @@ TOPICS = (
     Topic(
         ros.CUTTING_STATE,
         f'{OURS}/msg/State',
-        ros.STREAM,
+        qos.STREAM,
         'cutting',
         'with tissue/state',
         'the state of a stroke then',
@@ -105,7 +105,7 @@ TOPICS = (
     Topic(
         ros.MESH,
         f'{OURS}/msg/Mesh',
-        ros.LATCHED,
+        qos.LATCHED,
         TISSUE,
         'at start, every 5 s',
         'the whole tissue',
@@ -113,7 +113,7 @@ TOPICS = (
     Topic(
         ros.MESH_UPDATES,
         f'{OURS}/msg/MeshDelta',
-        ros.UPDATES,
+        qos.UPDATES,
         TISSUE,
         '30 Hz',
         'changes',
@@ -121,7 +121,7 @@ TOPICS = (
     Topic(
         ros.PIECES,
         f'{OURS}/msg/FreePiece',
-        ros.HISTORY,
+        qos.HISTORY,
         TISSUE,
         'on event',
         'a piece that has come off',
@@ -130,11 +130,11 @@ TOPICS = (
         topic
         for owner, by in ((ros.ARM, 'arm'), (BRIDGE, BRIDGE))
         for topic in (
-            Topic(f'{owner}/operating_state', STATE, ros.LATCHED, by, 'on event', 'CRTK state'),
+            Topic(f'{owner}/operating_state', STATE, qos.LATCHED, by, 'on event', 'CRTK state'),
             Topic(
                 f'{owner}/state_command',
                 COMMAND,
-                ros.EVENTS,
+                qos.EVENTS,
                 'whoever operates',
                 '',
                 'CRTK command',
@@ -144,7 +144,7 @@ TOPICS = (
     Topic(
         ros.E_STOP,
         'std_msgs/msg/Empty',
-        ros.EVENTS,
+        qos.EVENTS,
         'whoever operates',
         'on event',
         'any message presses E-STOP',
@@ -152,7 +152,7 @@ TOPICS = (
     Topic(
         f'{BRIDGE}/e_stopped',
         'std_msgs/msg/Bool',
-        ros.LATCHED,
+        qos.LATCHED,
         BRIDGE,
         'at start, on change',
         'whether E-STOP is pressed',
@@ -160,7 +160,7 @@ TOPICS = (
     Topic(
         ros.HAND,
         POSE,
-        ros.EVENTS,
+        qos.EVENTS,
         'whoever guides',
         'on event',
         "goal of the emulated arm's hand [m]",
@@ -168,12 +168,12 @@ TOPICS = (
     Topic(
         ros.MARKERS,
         'visualization_msgs/msg/MarkerArray',
-        ros.EVENTS,
+        qos.EVENTS,
         'viewer',
         '10 Hz while somebody listens',
         'tissue, tool and force, to draw',
     ),
-    Topic(ros.DIAGNOSTICS, DIAGNOSTICS, ros.EVENTS, 'every node', '1 Hz', 'how each node is'),
+    Topic(ros.DIAGNOSTICS, DIAGNOSTICS, qos.EVENTS, 'every node', '1 Hz', 'how each node is'),
 )
 
 SERVICES = (

@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from bench.trials.fuzz_messages import KINDS, Kind, Maker, huge
 from cutting_trainer.bags.message_class import message_class
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.session.graph import RECORDER_NODE
 
 BURST_MESSAGES = 100
@@ -276,8 +276,8 @@ class Fuzzer:
         ]
 
     def _ear(self, target: Target) -> Any:
-        qos = ros.LATCHED if target.latched else ros.NEWEST_BEST_EFFORT
-        return ros.polled(self._node, target.message_type, target.topic, qos)
+        profile = qos.LATCHED if target.latched else qos.NEWEST_BEST_EFFORT
+        return ros.polled(self._node, target.message_type, target.topic, profile)
 
 
 _FAST = ('measured_cp', 'measured_cv', 'measured_cf', 'servo_cf', 'contact')

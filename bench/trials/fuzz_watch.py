@@ -16,7 +16,7 @@ from visualization_msgs.msg import MarkerArray
 
 from bench.trials.fuzz_verdict import Node
 from bench.trials.soak import sample_process
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
@@ -60,7 +60,7 @@ class NodeObserver:
         self.problems: list[str] = []
         self.seen: Counter[str] = Counter()
         self._node, self._pids, self._forged = node, pids, forged
-        newest, best_effort = ros.polled, ros.NEWEST_BEST_EFFORT
+        newest, best_effort = ros.polled, qos.NEWEST_BEST_EFFORT
         fast: tuple[tuple[Any, str, StampedCodec], ...] = (
             (Contact, ros.CONTACT, ContactCodec()),
             (ForceSample, ros.FORCE, ForceSampleCodec()),

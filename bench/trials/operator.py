@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bench.trials.chaos_verdict import Observations
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
 from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
 from cutting_trainer.node_common.orientation import quaternion
@@ -66,22 +66,22 @@ class Operator:
         types = crtk_types()
         self._command_type = types.command
         self._wrench = WrenchStampedCodec()
-        self._servo = ros.polled(node, WrenchStamped, f'{ros.ARM}/servo_cf', ros.STREAM)
-        self._felt = ros.polled(node, WrenchStamped, f'{ros.ARM}/measured_cf', ros.STREAM)
-        self._force = ros.polled(node, ForceSample, ros.FORCE, ros.STREAM)
-        self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
-        self._goals = node.create_publisher(PoseStamped, ros.HAND, ros.EVENTS)
+        self._servo = ros.polled(node, WrenchStamped, f'{ros.ARM}/servo_cf', qos.STREAM)
+        self._felt = ros.polled(node, WrenchStamped, f'{ros.ARM}/measured_cf', qos.STREAM)
+        self._force = ros.polled(node, ForceSample, ros.FORCE, qos.STREAM)
+        self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
+        self._goals = node.create_publisher(PoseStamped, ros.HAND, qos.EVENTS)
         self._states = {
-            name: ros.polled(node, types.operating_state, f'{name}/operating_state', ros.LATCHED)
+            name: ros.polled(node, types.operating_state, f'{name}/operating_state', qos.LATCHED)
             for name in (ros.ARM, BRIDGE_NODE)
         }
         self._commands = {
-            name: node.create_publisher(types.command, f'{name}/state_command', ros.EVENTS)
+            name: node.create_publisher(types.command, f'{name}/state_command', qos.EVENTS)
             for name in self._states
         }
         self._reset = node.create_client(Trigger, f'{BRIDGE_NODE}/reset_e_stop')
         self._newest: dict[str, Any] = {}
-        self._faults = node.create_publisher(String, FAULTS, ros.HISTORY)
+        self._faults = node.create_publisher(String, FAULTS, qos.HISTORY)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(node)
         self._stop = threading.Event()

@@ -15,17 +15,9 @@ from cutting_trainer.node_common.cdr_codec import (
 )
 from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
 from cutting_trainer.node_common.parameters import parameter
+from cutting_trainer.node_common.qos import EVENTS, NEWEST_BEST_EFFORT, STREAM
 from cutting_trainer.node_common.realtime import prepare, run_real_time
-from cutting_trainer.node_common.ros import (
-    ARM,
-    EVENTS,
-    NEWEST_BEST_EFFORT,
-    STREAM,
-    polled,
-    stamp,
-    take,
-    take_raw,
-)
+from cutting_trainer.node_common.ros import ARM, polled, stamp, take, take_raw
 from cutting_trainer.node_common.stamps import nanoseconds
 from cutting_trainer.node_common.timing import PeriodicLoop
 

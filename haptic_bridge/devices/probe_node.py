@@ -26,7 +26,8 @@ from cutting_trainer.haptic_bridge.devices.probe_pose import find_rotation
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
 from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.node_common.orientation import from_quaternion
-from cutting_trainer.node_common.ros import EVENTS, LATCHED, STREAM, polled, take, take_raw
+from cutting_trainer.node_common.qos import EVENTS, LATCHED, STREAM
+from cutting_trainer.node_common.ros import polled, take, take_raw
 
 FIRST_POSE_TIMEOUT_S = 5.0
 """[s] in which a publisher, and its first pose, must appear."""

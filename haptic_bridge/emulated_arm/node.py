@@ -30,15 +30,12 @@ from cutting_trainer.node_common.orientation import from_quaternion, quaternion
 from cutting_trainer.node_common.output import announce
 from cutting_trainer.node_common.parameters import parameter, scene_parameter, seed_parameter
 from cutting_trainer.node_common.publishers import PublisherMonitor
+from cutting_trainer.node_common.qos import EVENTS, LATCHED, NEWEST_BEST_EFFORT, STREAM
 from cutting_trainer.node_common.realtime import prepare, run_real_time
 from cutting_trainer.node_common.rejections import MessageError, require_frame
 from cutting_trainer.node_common.ros import (
     ARM,
-    EVENTS,
     HAND,
-    LATCHED,
-    NEWEST_BEST_EFFORT,
-    STREAM,
     Diagnostics,
     listen,
     polled,

@@ -10,7 +10,7 @@ from cutting_trainer_msgs.msg import Mesh, MeshDelta
 from cutting_trainer_msgs.srv import GetMesh
 from rclpy.node import Node
 
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.parameters import parameter
 from cutting_trainer.node_common.rejections import RejectionStatistics, require_frame
 from cutting_trainer.node_common.stamps import nanoseconds, newer
@@ -62,8 +62,8 @@ class MeshFollower:
         self.stale = 0
         self._stamp = 0
         self._accepted = 0.0
-        self._mesh = ros.polled(node, Mesh, ros.MESH, ros.LATCHED)
-        self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, ros.UPDATES)
+        self._mesh = ros.polled(node, Mesh, ros.MESH, qos.LATCHED)
+        self._updates = ros.polled(node, MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
         self._client = node.create_client(GetMesh, ros.GET_MESH)
         self._answers: deque[Mesh] = deque(maxlen=2)
         self._asked = 0.0

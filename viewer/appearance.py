@@ -1,4 +1,4 @@
-"""Drawn shapes of a page: tool, colours, floor, first camera."""
+"""Appearance of a page: colours, the drawn tool, the floor, the first camera."""
 
 from typing import Any
 
