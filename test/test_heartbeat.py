@@ -17,7 +17,6 @@ from test_supervisor import (
     ROOT,
     Ledger,
     command,
-    later,
     ledger,
     wait_for_line,
 )
@@ -49,8 +48,8 @@ def test_frozen_node_is_killed_told_and_started_again_where_nodes_are(
     ) as supervisor:
         assert supervisor.start()
         before = supervisor.pids
-        freeze = later(0.3, lambda: os.kill(before['cutting'], signal.SIGSTOP))
-        supervisor.run(PATIENCE_S + 2.5, tick=freeze)
+        os.kill(before['cutting'], signal.SIGSTOP)
+        supervisor.run(PATIENCE_S + 2.5)
         after = supervisor.pids
         outcome = supervisor.end()
     assert [death.node for death in outcome.deaths] == ['cutting']
