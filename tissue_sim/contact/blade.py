@@ -204,19 +204,20 @@ class Blade:
         self._moved = self._device_points - before
         self._points = self._lagging()
         self._immerse(mesh, positions)
-        cuts = np.zeros((0, 3, 3))
+        cuts, limit = np.zeros((0, 3, 3)), -1.0
         if not self._inside.any():
             self._fracture.forget()
         else:
             ends = np.concatenate([self._points, self._device_points])[np.tile(self._inside, 2)]
             cuts = self._fracture.near(positions[opened], ends)
             for _ in range(_MAX_SLIPS):
-                if not self._slip(stiffness, cuts):
+                limit = self._slip(stiffness, cuts)
+                if limit >= 0.0:
                     break
                 self._immerse(mesh, positions)
                 if not self._inside.any():
                     break
-        self._settle(stiffness, cuts)
+        self._settle(stiffness, cuts, limit)
 
     def let_go(self) -> None:
         """Let the edge follow the device without force: nothing is known of the tool."""
@@ -224,7 +225,7 @@ class Blade:
         self._corners, self._parts = np.zeros((0, 4), np.int64), np.zeros((0, 4))
         self._spans = np.zeros(0)
         self._fracture.forget()
-        self._settle(0.0, np.zeros((0, 3, 3)))
+        self._settle(0.0, np.zeros((0, 3, 3)), 0.0)
 
     def spring(
         self, positions: np.ndarray, ahead: np.ndarray, share: float, stiffness: float
@@ -357,8 +358,12 @@ class Blade:
         edge = self._device[0] - self._device[1]
         return np.asarray(edge / np.linalg.norm(edge))
 
-    def _slip(self, stiffness: float, cuts: np.ndarray) -> bool:
-        """Let the points slip whose springs exceed the resistance; return whether any did."""
+    def _slip(self, stiffness: float, cuts: np.ndarray) -> float:
+        """Let the points slip whose springs exceed the resistance.
+
+        Returns:
+            The largest force that the edge transmits as it is pulled [N]; -1 where a point slipped.
+        """
         ways, each = self._stretch(), stiffness / _WHOLE * self._spans
         pieces = self._piece() * self._spans
         fresh, limits = self._resist(ways, cuts, pieces)
@@ -366,7 +371,7 @@ class Blade:
         slid = np.maximum(sizes - limits / each, 0.0)
         slid = np.where(fresh == 0, np.minimum(slid, _MAX_FREE_SLIP), slid)
         if slid.max() < _SETTLED:
-            return False
+            return float(limits.sum())
         ways *= (slid / sizes)[:, None]
         rub = self._resistance.friction * float(pieces @ slid)
         self.paid += float(limits @ slid) - rub
@@ -380,7 +385,7 @@ class Blade:
             self._fracture.add(before, self._knots())
         else:
             self._fracture.leave()
-        return True
+        return -1.0
 
     def _resist(
         self, ways: np.ndarray, cuts: np.ndarray, pieces: np.ndarray
@@ -394,8 +399,14 @@ class Blade:
         )
         return found
 
-    def _settle(self, stiffness: float, cuts: np.ndarray) -> None:
-        """Update the output: force, torque, limit, and the edge as a line."""
+    def _settle(self, stiffness: float, cuts: np.ndarray, limit: float) -> None:
+        """Update the output: force, torque, limit, and the edge as a line.
+
+        Args:
+            stiffness: of the coupling [N/m].
+            cuts: triangles of cuts near the edge [m], shape (t, 3, 3).
+            limit: largest force as the edge is pulled now [N]; negative: unknown.
+        """
         self.force, self.torque, self.limit, self.lag = np.zeros(3), np.zeros(3), 0.0, 0.0
         count = len(self._corners)
         pieces = self._piece() * self._spans
@@ -410,9 +421,10 @@ class Blade:
         self.torque = np.cross(shares[:, None] * self._edge, pulls).sum(axis=0)
         self.lag = float(np.linalg.norm(stretch.mean(axis=0)))
         # As it is pulled now, or will be if the device moves on.
-        for ways in (stretch.copy(), self._moved[self._inside]):
-            limits = self._resist(ways, cuts, pieces)[1]
-            self.limit = max(self.limit, float(limits.sum()))
+        if limit < 0.0:
+            limit = float(self._resist(stretch.copy(), cuts, pieces)[1].sum())
+        moved = self._resist(self._moved[self._inside], cuts, pieces)[1]
+        self.limit = max(limit, float(moved.sum()))
         if count < _MIN_POINTS:
             self._tip = self._tip - stretch.mean(axis=0)
         else:

@@ -12,8 +12,8 @@ from cutting_trainer.tissue_sim.contact.tool import ToolContact
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 
-_PERIOD_S = 4.2e-3
-"""[s] Longest time between two evaluations: eight in a frame of 30 Hz."""
+_PERIOD_S = 5.6e-3
+"""[s] Longest time between two evaluations: six in a frame of 30 Hz."""
 
 
 class ToolInFrame:
