@@ -10,7 +10,10 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from cutting_trainer_msgs.msg import State
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy._rclpy_pybind11 import RMWError
+from rclpy.serialization import deserialize_message
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.message_class import message_class
@@ -122,6 +125,8 @@ class Recorder(ManagedNode):
         self._needless: dict[str, str] = {}
         self._drawings = self.resolve_topic_name(MARKERS)
         self._states = {self.resolve_topic_name(name) for name in (TISSUE_STATE, CUTTING_STATE)}
+        self._parts: dict[tuple[str, int], set[int]] = {}
+        self._complete_states: set[str] = set()
         self._inputs = [self.resolve_topic_name(name) for name in (CONTACT, FRAME_INPUTS)]
         self._begun = time.monotonic()
         self._collector = ParameterCollector(self)
@@ -169,23 +174,34 @@ class Recorder(ManagedNode):
         self._await_states()
 
     def _await_states(self) -> None:
-        """Record until the states have arrived, or until it is clear that none will.
+        """Record until the states are complete, or until it is clear that none will be.
 
         Without a state, nothing in a bag that begins within a session can be computed again.
         """
         deadline = time.monotonic() + _STATE_TIMEOUT_S
-        while not self._has_states() and time.monotonic() < deadline:
+        while self._expects_states() and time.monotonic() < deadline:
             time.sleep(_DISCOVERY_PERIOD_S)
             self.discover()
             self.drain()
 
-    def _has_states(self) -> bool:
-        """Return whether the state of every node that publishes one has been received."""
-        offered = [topic for topic in self._states if self.count_publishers(topic)]
-        if not offered:
-            return time.monotonic() - self._begun > _DISCOVERY_TIMEOUT_S
-        streams = [self._streams.get(topic) for topic in offered]
-        return all(stream is not None and stream.counter.received > 0 for stream in streams)
+    def _expects_states(self) -> bool:
+        """Return whether a node publishes a state of which parts are still to come."""
+        inputs = all(self.count_publishers(topic) for topic in self._inputs)
+        offered = [t for t in self._states - self._unrecorded.keys() if self.count_publishers(t)]
+        if not (inputs and offered):
+            return time.monotonic() - self._begun < _DISCOVERY_TIMEOUT_S
+        return any(topic not in self._complete_states for topic in offered)
+
+    def _note_state(self, topic: str, data: bytes) -> None:
+        """Note a part of a state; a state is complete when all its parts have been received."""
+        try:
+            state = deserialize_message(data, State)
+        except RMWError:
+            return  # it is recorded as it is, and is part of no state
+        parts = self._parts.setdefault((topic, state.step), set())
+        parts.add(state.part)
+        if len(parts) == state.parts:
+            self._complete_states.add(topic)
 
     def rest(self) -> None:
         """Record the received messages, and ignore later ones."""
@@ -261,6 +277,8 @@ class Recorder(ManagedNode):
                     continue
                 number = info['publication_sequence_number']
                 stream.counter.add(number)
+                if stream.topic in self._states - self._complete_states:
+                    self._note_state(stream.topic, data)
                 received = self._steady.of(info['received_timestamp'] or time.time_ns())
                 batch.append((received, stream.topic, info['source_timestamp'], data, number))
         batch.sort(key=itemgetter(0))

@@ -14,20 +14,23 @@ def tissue_at(bag: Bag, seconds: float | None = None) -> MeshReplica:
 
     Args:
         bag: to read.
-        seconds: moment [s] since the first message; None: the end.
+        seconds: moment [s] since the first message; None: the end. Before the first keyframe it is
+            that one.
 
     Raises:
-        BagError: there is no keyframe until then.
+        BagError: there is no keyframe, or the moment is before the bag.
     """
+    if seconds is not None and seconds < 0.0:
+        raise BagError(f'{bag.path} begins at 0 s: there is no tissue at {seconds:g} s')
     replica = MeshReplica()
     origin = first_time(bag)
     for recorded in tissue_messages(bag):
-        if seconds is not None and recorded.log_time - origin > seconds * 1e9:
+        late = seconds is not None and recorded.log_time - origin > seconds * 1e9
+        if late and replica.revision >= 0:
             break
         follow(replica, recorded.topic, bag.read(recorded))
     if replica.revision < 0:
-        until = '' if seconds is None else f' in its first {seconds:g} s'
-        raise BagError(f'{bag.path} has no message of {MESH}{until}: there is no tissue')
+        raise BagError(f'{bag.path} has no message of {MESH}: there is no tissue')
     return replica
 
 

@@ -23,6 +23,8 @@ _NEAR = 0.5
 of the median altitude."""
 _STRIP = 2.5
 """Way that is remembered of each end of a stroke, in edges."""
+_MAX_STRETCH = 4.0
+"""Largest length of an edge in the rest shape, relative to its length as it is."""
 _MAX_STRIPS = 32
 _EDGE = 1.5
 """Edge of a well-shaped element, in altitudes."""
@@ -128,6 +130,11 @@ class CombinedMethod:
         near = np.column_stack([positions[nodes], np.ones(len(nodes))])
         to_rest = np.linalg.lstsq(near, mesh.rest[nodes], rcond=None)[0]
         corners = np.column_stack([self._last, np.ones(4)]) @ to_rest
+        here, rest = (
+            np.linalg.norm(at[[0, 3]] - at[[1, 2]], axis=1) for at in (self._last, corners)
+        )
+        if (rest > _MAX_STRETCH * here).any():
+            return  # the map of few flat elements says nothing of an edge that is long beside them
         edge = corners[[3, 2]]
         if not len(self._lines):
             self._lines = corners[None, :2]

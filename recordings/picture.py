@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
+from cutting_trainer.bags.player import first_time
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.tissue import first_current_keyframe, follow
 from cutting_trainer.bags.topics import CONTACT, MESH, SERVO_CF, UPDATES, of_session
@@ -92,7 +93,7 @@ def read_story(bag: Path, at: float | None) -> Story:
     servo_cf = of_session(SERVO_CF, opened.topics())
     first = first_current_keyframe(opened)
     known_from = 0 if first is None else first.log_time
-    until = math.inf if at is None else at
+    until = math.inf if at is None else max(first_time(opened) + at * 1e9, known_from)
     for message in opened.messages():
         start = start or message.log_time
         time = (message.log_time - start) * 1e-9
@@ -103,12 +104,11 @@ def read_story(bag: Path, at: float | None) -> Story:
         elif message.topic == servo_cf:
             norm = np.linalg.norm(wrenches.decode(message.data).values[force])
             forces.append([time, float(norm)])
-        elif message.topic in (MESH, UPDATES) and message.log_time >= known_from and time <= until:
+        elif message.topic in (MESH, UPDATES) and known_from <= message.log_time <= until:
             follow(story.replica, message.topic, opened.read(message))
     story.moment = time if at is None else min(at, time)
     if story.replica.revision < 0:
-        span = '' if at is None else f' in its first {at:g} s'
-        raise SessionError(f'{bag} has no message of {MESH}{span}: there is no tissue to draw')
+        raise SessionError(f'{bag} has no message of {MESH}: there is no tissue to draw')
     story.tool = np.array(tool, float).reshape(-1, 11)
     story.forces = np.array(forces, float).reshape(-1, 2)
     return story

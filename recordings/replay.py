@@ -175,7 +175,10 @@ def tissue_in_the_middle(bag: Bag, folder: Path) -> Path | None:
         folder: existing folder to write to.
     """
     first = first_current_keyframe(bag)
-    if first is None or first_keyframe(bag).step == 0:
+    if first is None:
+        return None
+    scene = first_keyframe(bag)
+    if scene.step == 0 and scene.topology == bag.read(first).topology:
         return None
     path = folder / 'tissue.checkpoint'
     path.write_bytes(first.data)

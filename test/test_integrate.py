@@ -16,7 +16,7 @@ from test_docs import made
 from bench.reference import topics as topic_reference
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.haptic_bridge.settings import DeviceSettings
-from cutting_trainer.node_common import ros
+from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
 from cutting_trainer.session.graph import (
     BRIDGE_NODE,
@@ -79,14 +79,21 @@ def offered() -> dict[str, QoSProfile]:
         for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
             if getattr(getattr(call, 'func', None), 'attr', '') == 'create_publisher':
                 assert isinstance(call, ast.Call)
-                _, topic, qos = map(ast.unparse, call.args[:3])
+                _, topic, profile = map(ast.unparse, call.args[:3])
                 if path.parent.name == 'viewer' and 'command' in topic:
                     continue  # to others, in the types that they have
                 for owner in (ros.ARM, 'haptic_bridge') if 'name' in topic else ('',):
                     device = DeviceSettings(profile='emulated')
-                    scope = {'ros': ros, 'name': owner, 'device': device, **vars(ros)}
+                    scope = {
+                        'ros': ros,
+                        'qos': qos,
+                        'name': owner,
+                        'device': device,
+                        **vars(ros),
+                        **vars(qos),
+                    }
                     scope['BRIDGE'] = 'haptic_bridge'
-                    found[eval(topic, scope)] = eval(qos, scope)
+                    found[eval(topic, scope)] = eval(profile, scope)
     return found
 
 

@@ -101,7 +101,10 @@ def test_what_shorter_steps_do_not_mend_is_taken_back_with_no_force(
     assert press(tissue, 3) == []
 
 
-def test_a_blade_in_a_tissue_that_diverges_within_a_frame_is_not_asked_where_it_is() -> None:
+@pytest.mark.parametrize('speed', [1e3, 1e200, 1e308])
+def test_a_blade_in_a_tissue_that_diverges_within_a_frame_is_not_asked_where_it_is(
+    speed: float,
+) -> None:
     tissue = simulation()
     asked: list[bool] = []
 
@@ -114,10 +117,10 @@ def test_a_blade_in_a_tissue_that_diverges_within_a_frame_is_not_asked_where_it_
             return Coupling()
 
         def after(self, _share: float, positions: np.ndarray) -> Coupling:
-            asked.append(bool(np.isfinite(positions).all()))
+            asked.append(bool(np.abs(positions).max() < 0.2))
             return Coupling()
 
-    tissue.dynamics.velocity[:] = 1e308
+    tissue.dynamics.velocity[:] = speed
     with np.errstate(all='ignore'):
         assert tissue.dynamics.advance(Coupling(), WatchingTool()).diverged
     assert all(asked)

@@ -242,7 +242,7 @@ def test_launcher_is_asked_for_what_is_on_offer_and_in_short_lines(everything: A
     page.wait(lambda: not allowed(page, 'reset'), 'the control')
     viewer.answer(problem='This could not be done: the terminal says why.')
     page.wait(lambda: 'terminal' in page.values.get('notice', {}).get('text', ''), 'the notice')
-    assert allowed(page, 'reset')
+    page.wait(lambda: allowed(page, 'reset'), 'the control')
 
 
 def test_force_scale_that_nobody_takes_stays(everything: Any) -> None:

@@ -37,6 +37,14 @@ class DivergenceDetector:
         """Restart the balance at an energy [J], after a cut for example."""
         self._account = energy
 
+    def has_left(self, u: np.ndarray) -> bool:
+        """Return whether a node has moved farther than the tissue is long, or to no number.
+
+        Args:
+            u: displacement [m], shape (n, 3).
+        """
+        return not float(np.abs(u).max(initial=0.0)) < self._size  # true for NaN
+
     def diagnose(self, u: np.ndarray, energy: float, work: float) -> str:
         """Return why a frame diverges, as a sentence; '' if it does not, and the balance continues.
 
@@ -45,8 +53,8 @@ class DivergenceDetector:
             energy: kinetic and elastic [J].
             work: of the tool in this frame [J].
         """
-        farthest = float(np.abs(u).max(initial=0.0))
-        if not farthest < self._size:  # also true for NaN
+        if self.has_left(u):
+            farthest = float(np.abs(u).max())
             return (
                 f'a node would have moved {farthest:.3g} m, farther than the tissue is long, '
                 f'{self._size:.3g} m'

@@ -362,10 +362,9 @@ class Dynamics:
                 self.loads.advance(self._u[:size], dt * steps, near)
             if tool is not None and done >= part * substeps // parts:
                 part += 1
-                positions = self.positions
-                if not np.isfinite(positions).all():
-                    break  # a diverged tissue holds no tool: the detector takes the frame back
-                coupling = tool.after(done / substeps, positions)
+                if self._detector.has_left(self.displacement):
+                    break  # a diverged tissue holds no tool: the frame will be taken back
+                coupling = tool.after(done / substeps, self.positions)
                 spring = coupling.spring(self.mesh.rest)
         return work
 
