@@ -11,7 +11,7 @@ from meshes import box
 from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutCommand, Frame, ToolContact
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.mesh.locate import barycentric, locate_points
+from cutting_trainer.tissue_sim.mesh.locate import barycentric, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
@@ -245,8 +245,7 @@ def test_points_of_an_edge_are_found_where_a_look_at_every_element_finds_them() 
     for _ in range(20):
         low = random.uniform(0.0, [0.03, 0.025, 0.02])
         points = low + np.linspace(0.0, 1.0, 24)[:, None] * np.array([0.004, -0.003, 0.02])
-        found, weights = np.empty(len(points), np.int64), np.empty((len(points), 4))
-        locate_points(mesh.rest, mesh.tetrahedra, mesh.neighbors, points, 0, found, weights)
+        found, weights = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, points)
         out = np.empty(4)
         for point, tet, weight in zip(points, found, weights, strict=True):
             least = [

@@ -78,7 +78,7 @@ def turn(rate: float, seconds: float = 1.0) -> tuple[float, float]:
         v, c = simulation.velocity, simulation.material
         lost += c.beta * float(np.sum(v * simulation.model.force(v))) / rate
         lost += c.alpha * float(simulation.model.mass @ np.square(v).sum(axis=1)) / rate
-    stretch = blade._stretch()
+    stretch = blade.stretch
     stored = COUPLING * float(np.square(stretch).sum()) / 48  # half of 400 / 24 by spring
     return work - lost - stored - frame.elastic_energy - frame.kinetic_energy, blade.paid
 

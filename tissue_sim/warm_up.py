@@ -20,7 +20,7 @@ from cutting_trainer.tissue_sim.mesh.checks import components
 from cutting_trainer.tissue_sim.mesh.locate import (
     closest_triangle,
     distance_to_triangles,
-    locate_points,
+    find_tetrahedra,
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
@@ -86,15 +86,7 @@ def warm_up_frames(integrator: IntegratorName) -> None:
     components(mesh.node_count, mesh.triangles[:, :2])
     distance_to_triangles(far, simulation.positions, mesh.triangles)
     closest_triangle(far, mesh.rest, mesh.triangles)
-    locate_points(
-        simulation.positions,
-        mesh.tetrahedra,
-        mesh.neighbors,
-        far[None],
-        0,
-        np.empty(1, np.int64),
-        np.empty((1, 4)),
-    )
+    find_tetrahedra(simulation.positions, mesh.tetrahedra, mesh.neighbors, far[None])
 
 
 @cache

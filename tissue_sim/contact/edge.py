@@ -1,112 +1,518 @@
-"""Kernels of the blade's edge: its points in the air, its length in the tissue, its resistance."""
+"""Kernels of the blade's edge: it slips through the tissue, and the tissue takes it along."""
+
+from typing import NamedTuple
 
 import numpy as np
 
-from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.contact.fracture import look_ahead
+from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.contact.fracture import (
+    BLADE_THICKNESS,
+    KNOTS,
+    add_strip,
+    faces_near,
+    look_ahead,
+)
 from cutting_trainer.tissue_sim.mesh.locate import locate_points
 
+POINTS = 48
+WHOLE = POINTS / 2
+"""Points in the tissue at which their springs are as stiff as the coupling: half of the edge. Each
+has the same stiffness however many there are, else a spring that goes in or out would take energy
+from the others or give it to them."""
+SHARES = (np.arange(POINTS) + 0.5) / POINTS
+"""Places of the points along the edge, from its tip to its root."""
+_KNOTS = np.rint(np.linspace(0, POINTS - 1, KNOTS)).astype(np.int64)
+_TESTS = 8
+"""Places of a piece at which the end of the tissue is looked for."""
+_MAX_SLIPS = 12
+_MAX_STEPS = 100
+"""Places at which tissue is looked for between an edge in the air and the device's."""
+_MAX_FREE_SLIP = BLADE_THICKNESS / 2
+"""[m] by which the edge slips along a cut before what is ahead of it is looked up again."""
+_SETTLED = 1e-6
+"""[m] of slip below which the edge counts as at rest."""
+_MIN_POINTS = 4
+"""Points in the tissue from which on they tell the direction of the edge."""
 _TINY = 1e-300
 
 
-@kernel
-def lag_behind(device, points, inside, shares):
-    """Return the points, with those in the air as far behind as the nearest in the tissue.
+class Edge(NamedTuple):
+    """Points along the blade's edge, from its tip to its root; kernels change them in place.
 
-    Between two points in the tissue, the lag is interpolated.
+    Attributes:
+        points: [m], shape (POINTS, 3).
+        corners: nodes of the tetrahedron around each, shape (POINTS, 4).
+        weights: barycentric coordinates in it, shape (POINTS, 4).
+        spans: how much of the edge each stands for [pieces]; 0: in the air, shape (POINTS,).
+        hint: a tetrahedron near the edge, shape (1,).
+    """
+
+    points: np.ndarray
+    corners: np.ndarray
+    weights: np.ndarray
+    spans: np.ndarray
+    hint: np.ndarray
+
+
+class Tissue(NamedTuple):
+    """The tissue as operand of the kernels.
+
+    Attributes:
+        positions: nodes now [m], shape (n, 3).
+        tetrahedra, neighbors: of the mesh, shape (m, 4).
+        near: tetrahedra among which points are looked for, shape (k,).
+        opened: triangles of the surface that cuts have opened, shape (c, 3).
+    """
+
+    positions: np.ndarray
+    tetrahedra: np.ndarray
+    neighbors: np.ndarray
+    near: np.ndarray
+    opened: np.ndarray
+
+
+class Law(NamedTuple):
+    """Constants of the law.
+
+    Attributes:
+        stiffness: of the spring of a point, for each piece that it stands for [N/m].
+        toughness: [J/m^2].
+        friction: per length [N/m].
+    """
+
+    stiffness: float
+    toughness: float
+    friction: float
+
+
+class Pull(NamedTuple):
+    """How the device pulls the edge.
+
+    Attributes:
+        force: on the tissue [N], shape (3,).
+        torque: the same about the tip of the device's edge [N m], shape (3,).
+        limit: largest force of the edge as it is pulled, or would as it is moved [N].
+        line: lag of the tip, and how much more the root lags [m], shape (2, 3).
+        lag: mean distance in the tissue [m].
+        paid, rubbed: work of cutting and of friction [J].
+    """
+
+    force: np.ndarray
+    torque: np.ndarray
+    limit: float
+    line: np.ndarray
+    lag: float
+    paid: float
+    rubbed: float
+
+
+@kernel
+def follow_device(edge, strips, device, moved, tissue, law):
+    """Let the edge slip after the device's edge, and return its `Pull`.
 
     Args:
-        device: points of the device's edge [m], shape (p, 3).
-        points: those of the edge [m], shape (p, 3).
-        inside: which are in the tissue, shape (p,).
-        shares: their places along the edge, ascending, shape (p,).
+        edge: `Edge`, changed.
+        strips: `Strips`, changed.
+        device: points of the device's edge [m], shape (POINTS, 3).
+        moved: motion of these points [m], shape (POINTS, 3).
+        tissue: `Tissue`.
+        law: `Law`.
+    """
+    direction, piece = _direction(device)
+    _lag_behind(edge, device)
+    _immerse(edge, device, tissue)
+    paid, rubbed, limit = 0.0, 0.0, -1.0
+    if not edge.spans.any():
+        strips.counts[:] = 0
+        none = np.zeros(3)
+        return Pull(none, none.copy(), 0.0, np.zeros((2, 3)), 0.0, paid, rubbed)
+    low, high = _box(edge, device)
+    faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
+    for _ in range(_MAX_SLIPS):
+        limit, cut, rub = _slip(edge, strips, device, faces, direction, piece, law)
+        paid, rubbed = paid + cut, rubbed + rub
+        if limit >= 0.0:
+            break
+        _immerse(edge, device, tissue)
+        if not edge.spans.any():
+            break
+    ways = device - edge.points
+    fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
+    if limit < 0.0:
+        _resist(edge, ways.copy(), faces, direction, piece, law, fresh, limits)
+        limit = limits.sum()
+    # As it is pulled now, or will be if the device moves on.
+    _resist(edge, moved.copy(), faces, direction, piece, law, fresh, limits)
+    limit = max(limit, limits.sum())
+    force, torque = np.zeros(3), np.zeros(3)
+    for i in range(POINTS):
+        pull = law.stiffness * edge.spans[i] * ways[i]
+        arm = SHARES[i] * POINTS * piece * direction
+        force += pull
+        torque += np.cross(arm, pull)
+    line, mean = _line(edge.spans, ways)
+    return Pull(force, torque, limit, line, np.sqrt((mean**2).sum()), paid, rubbed)
+
+
+@kernel
+def carry_edge(edge, strips, device, moved, positions, law):
+    """Move the edge with the tissue.
+
+    The edge is rigid: tissue that slides along it takes it along by no more than friction does, or
+    a hand that slices (Atkins). Else the tissue that heaps up before a blade would lift the edge
+    out.
+
+    Args:
+        edge: `Edge`, changed.
+        strips: `Strips`, changed.
+        device, moved: as for `follow_device`.
+        positions: nodes now, of the same mesh as at the last `follow_device` [m], shape (n, 3).
+        law: `Law`.
 
     Returns:
-        A new array [m], shape (p, 3); the device's points where none is in the tissue.
+        Motion of tip and root relative to the tip with the tissue [m], shape (2, 3), and the work
+        of friction [J].
     """
-    count, out, last = len(points), device.copy(), -1
-    for i in range(count):
-        if inside[i]:
-            out[i] = points[i]
+    direction, piece = _direction(device)
+    grip = law.friction * piece / law.stiffness
+    ways, rubbed, first, last = np.zeros((POINTS, 3)), 0.0, -1, 0
+    for i in range(POINTS):
+        if edge.spans[i] == 0.0:
+            continue
+        first, last = i if first < 0 else first, i
+        carried = np.zeros(3)
+        for k in range(4):
+            for c in range(3):
+                carried[c] += edge.weights[i, k] * positions[edge.corners[i, k], c]
+        held, pulled = _split(device[i] - edge.points[i], direction)
+        sliced, pushed = _split(moved[i], direction)
+        ratio = sliced / pushed if pushed > 0.0 else 0.0
+        most = max(max(held, grip), ratio * pulled)
+        stretch = _dot(device[i] - carried, direction)
+        kept = min(max(stretch, -most), most)
+        rubbed += 0.5 * law.stiffness * edge.spans[i] * (stretch**2 - kept**2)
+        ways[i] = carried - edge.points[i]
+        edge.points[i] = carried + (stretch - kept) * direction
+    line, _ = _line(edge.spans, ways)
+    for k in range(KNOTS):
+        share = min(max(SHARES[_KNOTS[k]], SHARES[first]), SHARES[last])
+        way = line[0] + share * line[1]
+        way -= _dot(way, direction) * direction
+        for s in range(strips.counts[0]):
+            for c in range(3):
+                strips.knots[s, 0, k, c] += way[c]
+                strips.knots[s, 1, k, c] += way[c]
+    return line, rubbed
+
+
+@kernel
+def gather_loads(edge, loads):
+    """Return the nodes around the edge, ascending, and the share of the load on each.
+
+    Args:
+        edge: `Edge`.
+        loads: of the points, shape (POINTS,).
+    """
+    nodes, shares, count = np.empty(4 * POINTS, np.int64), np.empty(4 * POINTS), 0
+    for i in range(POINTS):
+        if edge.spans[i] == 0.0:
+            continue
+        for k in range(4):
+            node = edge.corners[i, k]
+            at = count
+            while at > 0 and nodes[at - 1] >= node:
+                at -= 1
+            if at == count or nodes[at] != node:
+                for j in range(count, at, -1):
+                    nodes[j], shares[j] = nodes[j - 1], shares[j - 1]
+                nodes[at], shares[at], count = node, 0.0, count + 1
+            shares[at] += loads[i] * edge.weights[i, k]
+    return nodes[:count].copy(), shares[:count].copy()
+
+
+@inner
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inner
+def _split(way, direction):
+    """Return the lengths of a way along a direction and across it [m]."""
+    along = _dot(way, direction)
+    across = way - along * direction
+    return abs(along), np.sqrt(_dot(across, across))
+
+
+@inner
+def _direction(device):
+    """Return the unit vector from tip to root, and the length that a point stands for [m]."""
+    edge = device[POINTS - 1] - device[0]
+    length = np.sqrt(_dot(edge, edge))
+    return edge / length, length / (POINTS - 1)
+
+
+@inner
+def _box(edge, device):
+    """Return a box around the edge and the device's, where they are in the tissue [m], (3,)."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for i in range(POINTS):
+        if edge.spans[i] > 0.0:
+            for c in range(3):
+                x, y = edge.points[i, c], device[i, c]
+                low[c], high[c] = min(low[c], min(x, y)), max(high[c], max(x, y))
+    return low - BLADE_THICKNESS, high + BLADE_THICKNESS
+
+
+@inner
+def _lag_behind(edge, device):
+    """Move the points in the air as far behind the device's as the nearest in the tissue are.
+
+    Between two points in the tissue, the lag is interpolated. Without any, there is none.
+    """
+    points, last = edge.points, -1
+    for i in range(POINTS):
+        if edge.spans[i] > 0.0:
             last = i
             continue
         ahead = i + 1
-        while ahead < count and not inside[ahead]:
+        while ahead < POINTS and edge.spans[ahead] == 0.0:
             ahead += 1
-        if last < 0 and ahead == count:
-            return out
-        first, second = last if last >= 0 else ahead, ahead if ahead < count else last
+        if last < 0 and ahead == POINTS:
+            points[:] = device
+            return
+        first, second = last if last >= 0 else ahead, ahead if ahead < POINTS else last
         part = 0.0
         if first != second:
-            part = (shares[i] - shares[first]) / (shares[second] - shares[first])
+            part = (SHARES[i] - SHARES[first]) / (SHARES[second] - SHARES[first])
         for c in range(3):
             lag = (1.0 - part) * (device[first, c] - points[first, c])
-            out[i, c] -= lag + part * (device[second, c] - points[second, c])
-    return out
+            points[i, c] = device[i, c] - lag - part * (device[second, c] - points[second, c])
 
 
-@kernel
-def measure_lengths(positions, tetrahedra, neighbors, points, inside, piece, parts, hint):
-    """Return how much of the edge each point stands for [pieces], shape (p,).
+@inner
+def _locate(tissue, points, hint, found, weights):
+    locate_points(
+        tissue.positions,
+        tissue.tetrahedra,
+        tissue.neighbors,
+        tissue.near,
+        points,
+        hint,
+        found,
+        weights,
+    )
+
+
+@inner
+def _immerse(edge, device, tissue):
+    """Find the points in the tissue. Those in the air go with them: the edge is rigid.
+
+    Where a cut gapes so far that all are in the air, the edge goes on to the tissue before it,
+    which has still to be cut, or else to the device's.
+    """
+    found, before, any_inside, lost = np.empty(POINTS, np.int64), edge.spans.copy(), False, False
+    _locate(tissue, edge.points, edge.hint[0], found, edge.weights)
+    for i in range(POINTS):
+        lost = lost or (before[i] > 0.0 and found[i] < 0)
+        any_inside = any_inside or found[i] >= 0
+        edge.spans[i] = 1.0 if found[i] >= 0 else 0.0
+    if not any_inside:
+        _go_to_tissue(edge, device, tissue, found)
+    elif lost:
+        kept = edge.points.copy()
+        _lag_behind(edge, device)
+        for i in range(POINTS):
+            if before[i] == 0.0 or found[i] >= 0:
+                edge.points[i] = kept[i]
+        _locate(tissue, edge.points, edge.hint[0], found, edge.weights)
+    for i in range(POINTS - 1, -1, -1):
+        if found[i] < 0:
+            edge.spans[i] = 0.0
+            continue
+        edge.spans[i], edge.hint[0] = 1.0, found[i]
+        for k in range(4):
+            edge.corners[i, k] = tissue.tetrahedra[found[i], k]
+    _measure_spans(edge, device, tissue)
+    _relax(edge, device, tissue, before)
+
+
+@inner
+def _go_to_tissue(edge, device, tissue, found):
+    """Move an edge in the air to where it meets tissue on its way to the device's."""
+    ways, longest = device - edge.points, 0.0
+    for i in range(POINTS):
+        longest = max(longest, _dot(ways[i], ways[i]))
+    steps = min(int(np.ceil(np.sqrt(longest) / (BLADE_THICKNESS / 2))), _MAX_STEPS)
+    for step in range(1, steps + 1):
+        edge.points[:] = device - (1.0 - step / steps) * ways
+        _locate(tissue, edge.points, edge.hint[0], found, edge.weights)
+        if (found >= 0).any():
+            return
+    if steps == 0:
+        edge.points[:] = device
+        _locate(tissue, edge.points, edge.hint[0], found, edge.weights)
+
+
+@inner
+def _measure_spans(edge, device, tissue):
+    """Write how much of the edge each point stands for [pieces].
 
     At the end of the tissue it is the rest up to there, so that the force does not change in steps
     of a piece as the blade goes in.
-
-    Args:
-        positions: nodes now [m], shape (n, 3).
-        tetrahedra, neighbors: of the mesh, shape (m, 4).
-        points: of the edge [m], shape (p, 3).
-        inside: which are in the tissue, shape (p,).
-        piece: from a point to the next [m], shape (3,).
-        parts: places of a piece at which the end of the tissue is looked for, shape (q,).
-        hint: a tetrahedron near the edge.
     """
-    count, tested = len(points), len(parts)
-    lengths = np.ones(count)
-    beyond, found = np.empty((tested, 3)), np.empty(tested, np.int64)
-    weights = np.empty((tested, 4))
-    for i in range(count):
+    beyond, found = np.empty((_TESTS, 3)), np.empty(_TESTS, np.int64)
+    weights, piece = np.empty((_TESTS, 4)), device[1] - device[0]
+    inside = edge.spans > 0.0
+    for i in range(POINTS):
         for step in (-1, 1):
             beside = i + step
-            if not inside[i] or beside < 0 or beside >= count or inside[beside]:
+            if not inside[i] or beside < 0 or beside >= POINTS or inside[beside]:
                 continue
-            for k in range(tested):
+            for k in range(_TESTS):
                 for c in range(3):
-                    beyond[k, c] = points[i, c] + step * parts[k] * piece[c]
-            locate_points(positions, tetrahedra, neighbors, beyond, hint, found, weights)
+                    beyond[k, c] = edge.points[i, c] + step * (k + 1) / _TESTS * piece[c]
+            _locate(tissue, beyond, edge.hint[0], found, weights)
             reached = 0
-            while reached < tested and found[reached] >= 0:
+            while reached < _TESTS and found[reached] >= 0:
                 reached += 1
-            lengths[i] += reached / tested - 0.5
-        lengths[i] = max(lengths[i], parts[0])
-    return lengths
+            edge.spans[i] += reached / _TESTS - 0.5
+        if inside[i]:
+            edge.spans[i] = max(edge.spans[i], 1.0 / _TESTS)
 
 
-@kernel
-def resist(points, ways, cuts, pieces, edge, toughness, friction, reach, ahead):
-    """Return which points meet uncut tissue, and the largest force of each piece of the edge.
+@inner
+def _relax(edge, device, tissue, before):
+    """Spread the energy of points over the edge that has come into the tissue beside them.
 
     Args:
-        points: in the tissue [m], shape (p, 3).
-        ways: along which they are pulled [m]; changed as by `look_ahead`, shape (p, 3).
-        cuts: triangles of cuts near the edge [m], shape (t, 3, 3).
-        pieces: lengths of the pieces [m], shape (p,).
-        edge: unit vector along the edge, shape (3,).
-        toughness: [J/m^2].
-        friction: per length [N/m].
-        reach, ahead: as of `look_ahead` [m].
+        edge, device, tissue: as for `_immerse`.
+        before: `Edge.spans` before [pieces], shape (POINTS,).
+    """
+    one, found, weights = np.empty((1, 3)), np.empty(1, np.int64), np.empty((1, 4))
+    for i in range(POINTS):
+        had = before[i] if before[i] > 0.0 else 0.5
+        if edge.spans[i] <= had:
+            continue
+        stretch = device[i] - edge.points[i]
+        if np.abs(stretch).max() <= _SETTLED:
+            continue
+        one[0] = edge.points[i] + (1.0 - np.sqrt(had / edge.spans[i])) * stretch
+        _locate(tissue, one, edge.hint[0], found, weights)
+        if found[0] >= 0:
+            edge.points[i], edge.weights[i] = one[0], weights[0]
+            for k in range(4):
+                edge.corners[i, k] = tissue.tetrahedra[found[0], k]
+
+
+@inner
+def _knots(edge, device):
+    """Return some points of the edge, half a piece more at its ends [m], shape (KNOTS, 3)."""
+    knots, half = np.empty((KNOTS, 3)), (device[1] - device[0]) / 2
+    for k in range(KNOTS):
+        knots[k] = edge.points[_KNOTS[k]]
+    knots[0] -= half
+    knots[KNOTS - 1] += half
+    return knots
+
+
+@inner
+def _slip(edge, strips, device, faces, direction, piece, law):
+    """Let the points slip whose springs exceed the resistance.
 
     Returns:
-        1 where uncut tissue is ahead, else 0, shape (p,), and the forces J l sin(edge, way) +
-        friction [N], shape (p,).
+        The largest force that the edge transmits as it is pulled [N], -1 where a point slipped;
+        the work of cutting and that of friction [J].
     """
-    count = len(points)
-    fresh, limits = np.empty(count), np.empty(count)
-    look_ahead(points, ways, cuts, reach, ahead, fresh)
-    for i in range(count):
+    fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
+    slid, ways = np.zeros(POINTS), device - edge.points
+    _resist(edge, ways, faces, direction, piece, law, fresh, limits)
+    cutting = False
+    for i in range(POINTS):
+        if edge.spans[i] == 0.0:
+            continue
+        size = max(np.sqrt(_dot(ways[i], ways[i])), _TINY)
+        slid[i] = max(size - limits[i] / (law.stiffness * edge.spans[i]), 0.0)
+        if not fresh[i]:
+            slid[i] = min(slid[i], _MAX_FREE_SLIP)
+        ways[i] *= slid[i] / size
+        cutting = cutting or (fresh[i] and slid[i] > _SETTLED)
+    if slid.max() < _SETTLED:
+        return limits.sum(), 0.0, 0.0
+    knots = _knots(edge, device)
+    work, rub = 0.0, 0.0
+    for i in range(POINTS):
+        if edge.spans[i] > 0.0:
+            work += limits[i] * slid[i]
+            rub += law.friction * piece * edge.spans[i] * slid[i]
+            edge.points[i] += ways[i]
+    _lag_behind(edge, device)
+    if cutting:
+        add_strip(strips, knots, _knots(edge, device))
+    else:
+        strips.counts[1] = 0
+    return -1.0, work - rub, rub
+
+
+@inner
+def _resist(edge, ways, faces, direction, piece, law, fresh, limits):
+    """Find which points meet uncut tissue, and the largest force of each piece of the edge.
+
+    The forces are J l sin(edge, way) + friction.
+
+    Args:
+        edge: `Edge`.
+        ways: along which the points are pulled [m]; changed as by `look_ahead`, (POINTS, 3).
+        faces: `CutFaces`.
+        direction: unit vector along the edge, shape (3,).
+        piece: length that a point stands for [m].
+        law: `Law`.
+        fresh: output, whether uncut tissue is ahead, shape (POINTS,).
+        limits: output, forces [N], shape (POINTS,).
+    """
+    e0, e1, e2 = direction[0], direction[1], direction[2]
+    for i in range(POINTS):
+        fresh[i], limits[i] = False, 0.0
+        if edge.spans[i] == 0.0:
+            continue
+        fresh[i] = look_ahead(edge.points, ways, i, faces)
         x, y, z = ways[i, 0], ways[i, 1], ways[i, 2]
-        a, b, c = y * edge[2] - z * edge[1], z * edge[0] - x * edge[2], x * edge[1] - y * edge[0]
-        size = max(np.sqrt(x * x + y * y + z * z), _TINY)
-        sine = np.sqrt(a * a + b * b + c * c) / size
-        limits[i] = pieces[i] * (fresh[i] * toughness * sine + friction)
-    return fresh, limits
+        a, b, c = y * e2 - z * e1, z * e0 - x * e2, x * e1 - y * e0
+        sine = np.sqrt(a * a + b * b + c * c) / max(np.sqrt(x * x + y * y + z * z), _TINY)
+        cutting = law.toughness * sine if fresh[i] else 0.0
+        limits[i] = piece * edge.spans[i] * (cutting + law.friction)
+
+
+@inner
+def _line(spans, values):
+    """Return the line a + s b nearest to values at the points' places s, and their mean.
+
+    It is level where too few points are in the tissue.
+
+    Args:
+        spans: `Edge.spans`, shape (POINTS,).
+        values: shape (POINTS, 3).
+
+    Returns:
+        a and b, shape (2, 3), and the mean, shape (3,).
+    """
+    count, mean, middle = 0, np.zeros(3), 0.0
+    for i in range(POINTS):
+        if spans[i] > 0.0:
+            count += 1
+            middle += SHARES[i]
+            mean += values[i]
+    line = np.zeros((2, 3))
+    if count == 0:
+        return line, mean
+    middle, mean = middle / count, mean / count
+    line[0] = mean
+    if count < _MIN_POINTS:
+        return line, mean
+    along, square = np.zeros(3), 0.0
+    for i in range(POINTS):
+        if spans[i] > 0.0:
+            along += (SHARES[i] - middle) * values[i]
+            square += (SHARES[i] - middle) ** 2
+    line[1] = along / square
+    line[0] -= middle * line[1]
+    return line, mean

@@ -5,59 +5,49 @@ sources: the triangles opened by cuts, and the latest strips swept by the edge, 
 not contain yet.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.kernels import inner
 
 BLADE_THICKNESS = 4e-4
 """Of a scalpel's blade [m]. Up to half of it away from a cut, the blade is still in that cut."""
 KNOTS = 24
 """Points by which an edge is kept: its tip, its root, and between them."""
+MAX_STRIPS = 48
+_REACH = BLADE_THICKNESS / 2
+"""[m] from a triangle up to which a point is in the cut."""
+_AHEAD = 1e-4
+"""[m] ahead of the edge, where the tissue is tested for a cut."""
 _MAX_STRIP = 5e-4
-_MAX_STRIPS = 48
 _ROUNDING = 1e-9
 _MAX_SINE_ALONG_CUT = 0.5
 """Largest sine of the angle between a motion along a cut and that cut."""
+_BINS = 32
+"""Parts of the edge by which triangles are listed."""
 
 
-class CutStrips:
-    """The latest strips cut by the edge, moved with the tissue.
+class Strips(NamedTuple):
+    """The latest strips cut by the edge, moved with the tissue; kernels change them in place.
 
     Limitations: all of them move with the tissue at the blade. This holds near the blade; farther
         off the mesh has the cut. A motion up to 30 degrees off a cut counts as
         along it.
+
+    Attributes:
+        knots: of the edge before and after, from its tip to its root [m], shape
+            (MAX_STRIPS, 2, KNOTS, 3).
+        counts: number of strips, and whether the last one goes on, shape (2,).
     """
 
-    def __init__(self) -> None:
-        self._strips = np.zeros((0, 2, KNOTS, 3))
-        self._goes_on = False
+    knots: np.ndarray
+    counts: np.ndarray
 
-    def carry(self, ways: np.ndarray) -> None:
-        """Move the points of each strip with the tissue [m], shape (KNOTS, 3)."""
-        self._strips = self._strips + ways
-
-    def add(self, before: np.ndarray, after: np.ndarray) -> None:
-        """Add a strip cut by the edge.
-
-        Args:
-            before, after: points of the edge from its tip to its root [m], shape (KNOTS, 3).
-        """
-        if self._goes_on and _path_length(self._strips[-1, 0], after) < _MAX_STRIP:
-            self._strips = self._strips.copy()
-            self._strips[-1, 1] = after
-        else:
-            strip = np.stack([before, after])[None]
-            self._strips = np.concatenate([self._strips[1 - _MAX_STRIPS :], strip])
-        self._goes_on = True
-
-    def leave(self) -> None:
-        """Begin a new strip: the edge has moved without cutting."""
-        self._goes_on = False
-
-    def forget(self) -> None:
-        """Remove all strips: the edge has left the tissue."""
-        self._strips = self._strips[:0]
-        self._goes_on = False
+    @staticmethod
+    def empty() -> 'Strips':
+        """Return room for strips, without any."""
+        return Strips(np.zeros((MAX_STRIPS, 2, KNOTS, 3)), np.zeros(2, np.int64))
 
     def behind(self, distance: float) -> np.ndarray | None:
         """Return the edge at a distance [m] or more before the last strip's end, all along it.
@@ -67,24 +57,136 @@ class CutStrips:
         Returns:
             Its root and tip [m], shape (2, 3).
         """
-        for strip in self._strips[::-1]:
-            if np.linalg.norm(strip[0] - self._strips[-1, 1], axis=1).min() >= distance:
-                return np.asarray(strip[0][[-1, 0]])
-        return np.asarray(self._strips[0, 0][[-1, 0]]) if len(self._strips) else None
+        strips = self.knots[: self.counts[0]]
+        for strip in strips[::-1]:
+            if np.linalg.norm(strip[0] - strips[-1, 1], axis=1).min() >= distance:
+                return np.array(strip[0][[-1, 0]])
+        return np.array(strips[0, 0][[-1, 0]]) if len(strips) else None
 
-    def near(self, opened: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return the cut triangles whose bounding box meets that of some points.
 
-        Args:
-            opened: corners of the triangles opened by cuts [m], shape (c, 3, 3).
-            points: [m], shape (p, 3).
+class CutFaces(NamedTuple):
+    """Triangles of cuts near the edge, listed by the part of the edge that they lie beside.
 
-        Returns:
-            Their corners [m], shape (t, 3, 3).
-        """
-        low, high = points.min(axis=0) - BLADE_THICKNESS, points.max(axis=0) + BLADE_THICKNESS
-        found = np.empty((len(opened) + 2 * (KNOTS - 1) * len(self._strips), 3, 3))
-        return found[: _near(opened, np.ascontiguousarray(self._strips), low, high, found)]
+    Attributes:
+        planes: three affine functions of a place, as three factors and a constant: height above
+            the triangle [m], and two barycentric coordinates of its foot, shape (t, 3, 4).
+        line: unit vector along the edge, least coordinate along it [m], bins per metre, (5,).
+        starts: where the list of each bin begins, shape (_BINS + 1,).
+        listed: triangles of the bins, one after the other.
+    """
+
+    planes: np.ndarray
+    line: np.ndarray
+    starts: np.ndarray
+    listed: np.ndarray
+
+
+@inner
+def add_strip(strips, before, after):
+    """Add a strip cut by the edge, or lengthen the last one.
+
+    Args:
+        strips: `Strips`.
+        before, after: points of the edge from its tip to its root [m], shape (KNOTS, 3).
+    """
+    knots, counts = strips
+    count = counts[0]
+    if counts[1] and _path_length(knots[count - 1, 0], after) < _MAX_STRIP:
+        knots[count - 1, 1] = after
+        return
+    if count == MAX_STRIPS:
+        for k in range(count - 1):
+            knots[k] = knots[k + 1]
+        count -= 1
+    knots[count, 0], knots[count, 1] = before, after
+    counts[0], counts[1] = count + 1, 1
+
+
+@inner
+def _path_length(before, after):
+    longest = 0.0
+    for k in range(len(before)):
+        square = 0.0
+        for c in range(3):
+            square += (after[k, c] - before[k, c]) ** 2
+        longest = max(longest, square)
+    return np.sqrt(longest)
+
+
+@inner
+def faces_near(positions, opened, strips, low, high, direction):
+    """Return the `CutFaces` whose bounding boxes meet a box, of the strips after the others.
+
+    Strips are divided between their knots: first come the halves with the edge before.
+
+    Args:
+        positions: nodes now [m], shape (n, 3).
+        opened: triangles of the surface that cuts have opened, shape (c, 3).
+        strips: `Strips`.
+        low, high: corners of the box [m], shape (3,).
+        direction: unit vector along the edge, shape (3,).
+    """
+    knots, strip_count = strips.knots, strips.counts[0]
+    found = np.empty((len(opened) + 2 * (KNOTS - 1) * strip_count, 3, 3))
+    count = 0
+    for k in range(len(opened)):
+        for i in range(3):
+            found[count, i] = positions[opened[k, i]]
+        if _meets(found[count], low, high):
+            count += 1
+    for half in range(2):
+        for k in range(strip_count):
+            for i in range(KNOTS - 1):
+                for c in range(3):
+                    found[count, 0, c] = knots[k, 0, i + 1, c]
+                    found[count, 1, c] = knots[k, half, i, c]
+                    found[count, 2, c] = knots[k, 1, i + half, c]
+                if _meets(found[count], low, high):
+                    count += 1
+    found, planes = found[:count], np.empty((count, 3, 4))
+    for k in range(count):
+        _write_planes(found, planes, k)
+    line, starts, listed = _list_by_bin(found, low, high, direction)
+    return CutFaces(planes, line, starts, listed)
+
+
+@inner
+def _list_by_bin(triangles, low, high, direction):
+    """Return line, starts and list of `CutFaces` for triangles near a box."""
+    line = np.empty(5)
+    least, most = 0.0, 0.0
+    for c in range(3):
+        line[c] = direction[c]
+        at, beyond = direction[c] * low[c], direction[c] * high[c]
+        least, most = least + min(at, beyond), most + max(at, beyond)
+    line[3], line[4] = least, _BINS / (most - least)
+    margin = _REACH + _AHEAD + _ROUNDING
+    ranges = np.empty((len(triangles), 2), np.int64)
+    starts = np.zeros(_BINS + 1, np.int64)
+    for k in range(len(triangles)):
+        first, last = np.inf, -np.inf
+        for i in range(3):
+            at = 0.0
+            for c in range(3):
+                at += direction[c] * triangles[k, i, c]
+            first, last = min(first, at), max(last, at)
+        ranges[k, 0], ranges[k, 1] = _bin(line, first - margin), _bin(line, last + margin)
+        for b in range(ranges[k, 0], ranges[k, 1] + 1):
+            starts[b + 1] += 1
+    for b in range(_BINS):
+        starts[b + 1] += starts[b]
+    filled, listed = starts.copy(), np.empty(starts[_BINS], np.int64)
+    for k in range(len(triangles)):
+        for b in range(ranges[k, 0], ranges[k, 1] + 1):
+            listed[filled[b]] = k
+            filled[b] += 1
+    return line, starts, listed
+
+
+@inner
+def _bin(line, at):
+    """Return the bin of a coordinate along the edge [m]; beyond the ends, the last there."""
+    return int(min(max((at - line[3]) * line[4], 0.0), _BINS - 1.0))
 
 
 @inner
@@ -97,93 +199,53 @@ def _meets(triangle, low, high):
     return True
 
 
-@kernel
-def _near(opened, strips, low, high, found):
-    """Copy the triangles that meet a box, of the strips after the others; return their number.
-
-    Strips are divided between their knots: first come the halves with the edge before.
-    """
-    count = 0
-    for k in range(len(opened)):
-        if _meets(opened[k], low, high):
-            found[count] = opened[k]
-            count += 1
-    for half in range(2):
-        for k in range(len(strips)):
-            for i in range(strips.shape[2] - 1):
-                for c in range(3):
-                    found[count, 0, c] = strips[k, 0, i + 1, c]
-                    found[count, 1, c] = strips[k, half, i, c]
-                    found[count, 2, c] = strips[k, 1, i + half, c]
-                if _meets(found[count], low, high):
-                    count += 1
-    return count
-
-
-def _path_length(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.linalg.norm(a - b, axis=1).max())
-
-
 @inner
-def _normal(triangle, normal):
-    """Write the unit normal of a triangle's corners; return twice its area, 0 for a sliver."""
-    # No arrays of its own: an allocation takes longer than all the rest.
-    x, y, z = triangle[0, 0], triangle[0, 1], triangle[0, 2]
-    u0, u1, u2 = triangle[1, 0] - x, triangle[1, 1] - y, triangle[1, 2] - z
-    v0, v1, v2 = triangle[2, 0] - x, triangle[2, 1] - y, triangle[2, 2] - z
-    normal[0] = u1 * v2 - u2 * v1
-    normal[1] = u2 * v0 - u0 * v2
-    normal[2] = u0 * v1 - u1 * v0
-    size = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+def _write_planes(triangles, planes, k):
+    """Write the functions of `CutFaces.planes` of a triangle; no place is above a sliver."""
+    x, y, z = triangles[k, 0, 0], triangles[k, 0, 1], triangles[k, 0, 2]
+    u0, u1, u2 = triangles[k, 1, 0] - x, triangles[k, 1, 1] - y, triangles[k, 1, 2] - z
+    v0, v1, v2 = triangles[k, 2, 0] - x, triangles[k, 2, 1] - y, triangles[k, 2, 2] - z
+    n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    size = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
     if size < 1e-14:
-        return 0.0
-    for c in range(3):
-        normal[c] /= size
-    return size
+        planes[k] = 0.0
+        planes[k, 0, 3] = np.inf
+        return
+    n0, n1, n2 = n0 / size, n1 / size, n2 / size
+    _write_plane(planes, k, 0, n0, n1, n2, x, y, z)
+    a, b, c = (v1 * n2 - v2 * n1), (v2 * n0 - v0 * n2), (v0 * n1 - v1 * n0)
+    _write_plane(planes, k, 1, a / size, b / size, c / size, x, y, z)
+    a, b, c = (n1 * u2 - n2 * u1), (n2 * u0 - n0 * u2), (n0 * u1 - n1 * u0)
+    _write_plane(planes, k, 2, a / size, b / size, c / size, x, y, z)
 
 
 @inner
-def _over(triangle, normal, size, x, y, z, reach):
-    """Return whether a point is above or below a triangle, within `reach` [m]."""
-    a, b, c = triangle[0], triangle[1], triangle[2]
-    x, y, z = x - a[0], y - a[1], z - a[2]
-    if abs(x * normal[0] + y * normal[1] + z * normal[2]) > reach:
+def _write_plane(planes, k, row, a, b, c, x, y, z):
+    """Write an affine function with factors a, b, c that is zero at a place."""
+    planes[k, row, 0], planes[k, row, 1], planes[k, row, 2] = a, b, c
+    planes[k, row, 3] = -(a * x + b * y + c * z)
+
+
+@inner
+def _value(planes, k, row, x, y, z):
+    at = planes[k, row, 0] * x + planes[k, row, 1] * y + planes[k, row, 2] * z
+    return at + planes[k, row, 3]
+
+
+@inner
+def _over(planes, k, x, y, z):
+    """Return whether a place is above or below a triangle, within reach."""
+    if abs(_value(planes, k, 0, x, y, z)) > _REACH:
         return False
-    u0, u1, u2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    v0, v1, v2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    # Barycentric coordinates of the foot of the perpendicular.
-    beta = (y * v2 - z * v1) * normal[0] + (z * v0 - x * v2) * normal[1]
-    beta = (beta + (x * v1 - y * v0) * normal[2]) / size
-    gamma = (u1 * z - u2 * y) * normal[0] + (u2 * x - u0 * z) * normal[1]
-    gamma = (gamma + (u0 * y - u1 * x) * normal[2]) / size
+    beta, gamma = _value(planes, k, 1, x, y, z), _value(planes, k, 2, x, y, z)
     return beta >= -_ROUNDING and gamma >= -_ROUNDING and beta + gamma <= 1.0 + _ROUNDING
 
 
 @inner
-def _surround(triangle, margin, spheres, k):
-    """Write centre and squared radius of a sphere around a triangle, with a margin [m]."""
-    largest = 0.0
-    for c in range(3):
-        spheres[c, k] = (triangle[0, c] + triangle[1, c] + triangle[2, c]) / 3
-    for i in range(3):
-        square = 0.0
-        for c in range(3):
-            square += (triangle[i, c] - spheres[c, k]) ** 2
-        largest = max(largest, square)
-    spheres[3, k] = (np.sqrt(largest) + margin) ** 2
+def look_ahead(points, ways, i, faces):
+    """Return whether a point of the edge is pulled into uncut material, and guide it in a cut.
 
-
-@inner
-def _beyond(spheres, k, x, y, z):
-    square = (x - spheres[0, k]) ** 2 + (y - spheres[1, k]) ** 2 + (z - spheres[2, k]) ** 2
-    return square > spheres[3, k]
-
-
-@kernel
-def look_ahead(points, ways, triangles, reach, ahead, fresh):
-    """Find which points of the edge meet uncut material, and guide those in a cut along it.
-
-    A point is in a cut if it lies above or below a triangle, within `reach`. The cut's faces then
+    A point is in a cut if it lies above or below a triangle, within reach. The cut's faces then
     guide it, up to the cut's end. Elsewhere, what is ahead counts as cut if it lies in a cut along
     which the point moves.
 
@@ -191,65 +253,44 @@ def look_ahead(points, ways, triangles, reach, ahead, fresh):
         points: [m], shape (p, 3).
         ways: along which they are pulled [m]; of a guided point, its part along the cut remains,
             shape (p, 3).
-        triangles: corners of the cut triangles [m], shape (t, 3, 3).
-        reach: largest distance from a triangle at which a point is in the cut [m].
-        ahead: distance ahead of the points that is looked at [m].
-        fresh: output, 1 where a point is pulled into uncut material, else 0, shape (p,).
+        i: which point.
+        faces: `CutFaces`.
     """
-    # Others are too far from all points to be above or below any.
-    margin, kept = reach + ahead + _ROUNDING, np.empty_like(triangles)
-    low, high, count = np.empty(3), np.empty(3), 0
-    for c in range(3):
-        low[c], high[c] = points[:, c].min() - margin, points[:, c].max() + margin
-    for k in range(len(triangles)):
-        if _meets(triangles[k], low, high):
-            kept[count] = triangles[k]
-            count += 1
-    triangles = kept[:count]
-    normals, sizes = np.empty((count, 3)), np.empty(count)
-    spheres = np.empty((4, count))
-    for k in range(count):
-        sizes[k] = _normal(triangles[k], normals[k])
-        _surround(triangles[k], reach + _ROUNDING, spheres, k)
-    along = np.empty(3)
-    for i in range(len(points)):
-        fresh[i] = 1.0
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        for k in range(len(triangles)):
-            if sizes[k] == 0.0 or _beyond(spheres, k, x, y, z):
-                continue
-            if _over(triangles[k], normals[k], sizes[k], x, y, z, reach):
-                off = ways[i, 0] * normals[k, 0] + ways[i, 1] * normals[k, 1]
-                off += ways[i, 2] * normals[k, 2]
-                for c in range(3):
-                    along[c] = ways[i, c] - off * normals[k, c]
-                if not _is_fresh(
-                    points[i], along, ahead, triangles, normals, sizes, spheres, reach
-                ):
-                    fresh[i] = 0.0
-                    for c in range(3):
-                        ways[i, c] = along[c]
-                break
-        if fresh[i]:
-            way = ways[i]
-            if not _is_fresh(points[i], way, ahead, triangles, normals, sizes, spheres, reach):
-                fresh[i] = 0.0
+    planes, line, starts, listed = faces
+    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    a, b, c = ways[i, 0], ways[i, 1], ways[i, 2]
+    at = _bin(line, x * line[0] + y * line[1] + z * line[2])
+    near = listed[starts[at] : starts[at + 1]]
+    for k in near:
+        if not _over(planes, k, x, y, z):
+            continue
+        n0, n1, n2 = planes[k, 0, 0], planes[k, 0, 1], planes[k, 0, 2]
+        off = a * n0 + b * n1 + c * n2
+        u, v, w = a - off * n0, b - off * n1, c - off * n2
+        if not _is_fresh(planes, near, x, y, z, u, v, w):
+            ways[i, 0], ways[i, 1], ways[i, 2] = u, v, w
+            return False
+        break
+    return _is_fresh(planes, near, x, y, z, a, b, c)
 
 
 @inner
-def _is_fresh(point, way, ahead, triangles, normals, sizes, spheres, reach):
-    """Return whether material ahead of a point is in no cut along which the point moves."""
-    length = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+def _is_fresh(planes, near, x, y, z, a, b, c):
+    """Return whether material ahead of a point is in no cut along which the point moves.
+
+    Args:
+        planes: of `CutFaces`.
+        near: its triangles near the point.
+        x, y, z: the point [m].
+        a, b, c: its way [m].
+    """
+    length = np.sqrt(a * a + b * b + c * c)
     if length == 0.0:
         return False
-    part = ahead / length
-    x, y, z = point[0] + part * way[0], point[1] + part * way[1], point[2] + part * way[2]
-    for k in range(len(triangles)):
-        if sizes[k] == 0.0 or _beyond(spheres, k, x, y, z):
-            continue
-        across = normals[k, 0] * way[0] + normals[k, 1] * way[1] + normals[k, 2] * way[2]
-        if abs(across) > _MAX_SINE_ALONG_CUT * length:
-            continue
-        if _over(triangles[k], normals[k], sizes[k], x, y, z, reach):
+    part = _AHEAD / length
+    x, y, z = x + part * a, y + part * b, z + part * c
+    for k in near:
+        across = planes[k, 0, 0] * a + planes[k, 0, 1] * b + planes[k, 0, 2] * c
+        if abs(across) <= _MAX_SINE_ALONG_CUT * length and _over(planes, k, x, y, z):
             return False
     return True

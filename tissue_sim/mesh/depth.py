@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, locate_points
+from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
@@ -29,8 +29,7 @@ class SurfaceDepth:
             points: [m], shape (p, 3).
         """
         mesh, points = self._mesh, np.ascontiguousarray(points)
-        found, weights = np.empty(len(points), np.int64), np.empty((len(points), 4))
-        locate_points(mesh.rest, mesh.tetrahedra, mesh.neighbors, points, 0, found, weights)
+        found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, points)
         out = np.zeros(len(points))
         for i in np.flatnonzero(found >= 0):
             out[i] = distance_to_triangles(points[i], mesh.rest, self._free)

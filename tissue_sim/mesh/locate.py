@@ -5,7 +5,11 @@ import numpy as np
 from cutting_trainer.node_common.kernels import inner, kernel
 
 _INSIDE = -1e-9
+_MAX_WALK = 24
+"""Tetrahedra that a walk visits; in a strained tissue it may go in circles."""
 _FARTHER = 1.0 + 1e-9
+_SKIN = 5e-3
+"""[m] by which `NearElements` lists more than is asked for."""
 
 
 @inner
@@ -22,14 +26,13 @@ def barycentric(positions, tetrahedra, tet, point, out):
     Returns:
         The smallest of them, or -inf for a flat tetrahedron.
     """
-    o = positions[tetrahedra[tet, 0]]
-    a = positions[tetrahedra[tet, 1]]
-    b = positions[tetrahedra[tet, 2]]
-    c = positions[tetrahedra[tet, 3]]
-    ax, ay, az = a[0] - o[0], a[1] - o[1], a[2] - o[2]
-    bx, by, bz = b[0] - o[0], b[1] - o[1], b[2] - o[2]
-    cx, cy, cz = c[0] - o[0], c[1] - o[1], c[2] - o[2]
-    px, py, pz = point[0] - o[0], point[1] - o[1], point[2] - o[2]
+    # No views: counting the references to them takes longer than the arithmetic.
+    o, i, j, k = tetrahedra[tet, 0], tetrahedra[tet, 1], tetrahedra[tet, 2], tetrahedra[tet, 3]
+    x, y, z = positions[o, 0], positions[o, 1], positions[o, 2]
+    ax, ay, az = positions[i, 0] - x, positions[i, 1] - y, positions[i, 2] - z
+    bx, by, bz = positions[j, 0] - x, positions[j, 1] - y, positions[j, 2] - z
+    cx, cy, cz = positions[k, 0] - x, positions[k, 1] - y, positions[k, 2] - z
+    px, py, pz = point[0] - x, point[1] - y, point[2] - z
     nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
     determinant = ax * nx + ay * ny + az * nz
     if determinant == 0.0:
@@ -47,7 +50,7 @@ def barycentric(positions, tetrahedra, tet, point, out):
 def _walk(positions, tetrahedra, neighbors, point, start, out):
     """Walk from `start` through the face the point lies farthest beyond; -1: it left the body."""
     tet = start
-    for _ in range(200):
+    for _ in range(_MAX_WALK):
         if barycentric(positions, tetrahedra, tet, point, out) >= _INSIDE:
             return tet
         face = neighbors[tet, np.argmin(out)]
@@ -55,27 +58,6 @@ def _walk(positions, tetrahedra, neighbors, point, start, out):
             return -1
         tet = face // 4
     return -1
-
-
-@inner
-def _near(positions, tetrahedra, points):
-    """Return the tetrahedra whose bounding boxes meet that of some points, in order."""
-    low, high = points[0].copy(), points[0].copy()
-    for k in range(1, len(points)):
-        for i in range(3):
-            low[i], high[i] = min(low[i], points[k, i]), max(high[i], points[k, i])
-    out = np.empty(len(tetrahedra), np.int64)
-    count = 0
-    for tet in range(len(tetrahedra)):
-        meets = True
-        for i in range(3):
-            if not _spans(positions, tetrahedra, tet, i, low[i], high[i]):
-                meets = False
-                break
-        if meets:
-            out[count] = tet
-            count += 1
-    return out[:count]
 
 
 @inner
@@ -89,21 +71,62 @@ def _spans(positions, tetrahedra, tet, axis, low, high):
 
 
 @inner
-def _search(positions, tetrahedra, near, point, out):
+def _search(positions, tetrahedra, near, boxes, point, out):
     """Test every listed tetrahedron whose bounding box contains the point."""
-    for tet in near:
-        inside = True
-        for i in range(3):
-            if not _spans(positions, tetrahedra, tet, i, point[i], point[i]):
-                inside = False
-                break
-        if inside and barycentric(positions, tetrahedra, tet, point, out) >= _INSIDE:
-            return tet
+    x, y, z = point[0], point[1], point[2]
+    for k in range(len(near)):
+        inside = boxes[k, 0] <= x <= boxes[k, 3] and boxes[k, 1] <= y <= boxes[k, 4]
+        if not (inside and boxes[k, 2] <= z <= boxes[k, 5]):
+            continue
+        if barycentric(positions, tetrahedra, near[k], point, out) >= _INSIDE:
+            return near[k]
     return -1
 
 
 @kernel
-def locate_points(positions, tetrahedra, neighbors, points, hint, found, weights):
+def list_near(positions, tetrahedra, among, low, high):
+    """Return the tetrahedra whose bounding boxes meet a box, in order.
+
+    Args:
+        positions: node positions [m], shape (n, 3).
+        tetrahedra: shape (m, 4).
+        among: tetrahedra to test, shape (k,).
+        low, high: corners of the box [m], shape (3,).
+    """
+    out = np.empty(len(among), np.int64)
+    count = 0
+    for tet in among:
+        meets = True
+        for i in range(3):
+            if not _spans(positions, tetrahedra, tet, i, low[i], high[i]):
+                meets = False
+                break
+        if meets:
+            out[count] = tet
+            count += 1
+    return out[:count]
+
+
+@inner
+def _list_around(positions, tetrahedra, among, points):
+    """Return the tetrahedra whose bounding boxes meet that of some points, and their boxes."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for k in range(len(points)):
+        for i in range(3):
+            low[i], high[i] = min(low[i], points[k, i]), max(high[i], points[k, i])
+    near = list_near(positions, tetrahedra, among, low, high)
+    boxes = np.empty((len(near), 6))
+    for k in range(len(near)):
+        for i in range(3):
+            a, b = positions[tetrahedra[near[k], 0], i], positions[tetrahedra[near[k], 1], i]
+            c, d = positions[tetrahedra[near[k], 2], i], positions[tetrahedra[near[k], 3], i]
+            boxes[k, i] = min(min(a, b), min(c, d))
+            boxes[k, 3 + i] = max(max(a, b), max(c, d))
+    return near, boxes
+
+
+@kernel
+def locate_points(positions, tetrahedra, neighbors, among, points, hint, found, weights):
     """Find the tetrahedra that contain some points: by a walk from the last one, else a search.
 
     A walk fails outside and where the body is not convex, above all across an open cut. The first
@@ -113,23 +136,67 @@ def locate_points(positions, tetrahedra, neighbors, points, hint, found, weights
         positions: node positions [m], shape (n, 3).
         tetrahedra: shape (m, 4).
         neighbors: faces across, as `TetMesh.neighbors`, shape (m, 4).
+        among: tetrahedra that are searched, shape (k,).
         points: [m], shape (p, 3).
         hint: tetrahedron to begin with.
         found: output, the tetrahedron of each point or -1, shape (p,).
         weights: output, barycentric coordinates, shape (p, 4).
     """
     tet = min(max(hint, 0), len(tetrahedra) - 1)
-    near = np.empty(0, np.int64)
-    listed = False
+    near, boxes, listed = among, np.empty((0, 6)), False
     for k in range(len(points)):
         at = _walk(positions, tetrahedra, neighbors, points[k], tet, weights[k])
         if at < 0:
             if not listed:
-                near, listed = _near(positions, tetrahedra, points), True
-            at = _search(positions, tetrahedra, near, points[k], weights[k])
+                near, boxes = _list_around(positions, tetrahedra, among, points)
+                listed = True
+            at = _search(positions, tetrahedra, near, boxes, points[k], weights[k])
         found[k] = at
         if at >= 0:
             tet = at
+
+
+def find_tetrahedra(
+    positions: np.ndarray, tetrahedra: np.ndarray, neighbors: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which tetrahedra contain some points, as `locate_points` does among all.
+
+    Returns:
+        The tetrahedron of each point or -1, shape (p,), and barycentric coordinates, shape (p, 4).
+    """
+    found, weights = np.empty(len(points), np.int64), np.empty((len(points), 4))
+    every = np.arange(len(tetrahedra))
+    locate_points(positions, tetrahedra, neighbors, every, points, 0, found, weights)
+    return found, weights
+
+
+class NearElements:
+    """Tetrahedra near a box, listed again only after nodes or box have moved (a Verlet list).
+
+    Args:
+        tetrahedra: of the mesh, which keeps its connectivity, shape (m, 4).
+    """
+
+    def __init__(self, tetrahedra: np.ndarray) -> None:
+        self._tetrahedra = tetrahedra
+        self._listed = np.arange(len(tetrahedra))
+        self._before: np.ndarray | None = None
+        self._low = self._high = np.zeros(3)
+
+    def find(self, positions: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return the tetrahedra whose bounding boxes meet a box, in order.
+
+        Args:
+            positions: nodes now [m], shape (n, 3).
+            low, high: corners of the box [m], shape (3,).
+        """
+        moved = np.inf if self._before is None else np.abs(positions - self._before).max()
+        if (low - moved < self._low).any() or (high + moved > self._high).any():
+            self._before, self._low, self._high = positions, low - _SKIN, high + _SKIN
+            every = np.arange(len(self._tetrahedra))
+            self._listed = list_near(positions, self._tetrahedra, every, self._low, self._high)
+        near: np.ndarray = list_near(positions, self._tetrahedra, self._listed, low, high)
+        return near
 
 
 @kernel

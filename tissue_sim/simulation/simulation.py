@@ -11,7 +11,7 @@ from cutting_trainer.tissue_sim.contact.tool import ContactState, CutCommand, Fr
 from cutting_trainer.tissue_sim.contact.tool_spring import ContactName, ToolSprings, footprint_force
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
-from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, locate_points
+from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, Touched
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.divergence import MAX_TOOL_SPEED
@@ -279,9 +279,8 @@ class TissueSimulation:
         positions, mesh = self.positions, self.mesh
         if distance_to_triangles(contact.device, positions, mesh.triangles) <= contact.radius:
             return False
-        found = np.empty(1, np.int64)
         tip = contact.device[None]
-        locate_points(positions, mesh.tetrahedra, mesh.neighbors, tip, 0, found, np.empty((1, 4)))
+        found, _ = find_tetrahedra(positions, mesh.tetrahedra, mesh.neighbors, tip)
         return bool(found[0] < 0)
 
     def _reaction(self, coupling: Coupling, motion: FrameMotion) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 from cutting_trainer.tissue_sim.contact import (
     blade,
     coupling,
+    edge,
     footprint,
     fracture,
     friction,
@@ -63,6 +64,7 @@ _MODULES = (
     coupling,
     domains,
     dynamics,
+    edge,
     elastic_state,
     elasticity,
     footprint,

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.tissue_sim.contact.fracture import KNOTS
+from cutting_trainer.tissue_sim.contact.edge import POINTS
+from cutting_trainer.tissue_sim.contact.fracture import KNOTS, MAX_STRIPS
 from cutting_trainer.tissue_sim.contact.friction import GrippingSprings
 from cutting_trainer.tissue_sim.elasticity.adaptive_law import Law
 from cutting_trainer.tissue_sim.elasticity.corotational import KEPT, Elements
@@ -344,17 +345,16 @@ def _check_blade(simulation: TissueSimulation, n: int) -> None:
     blade: Any = simulation._blade
     if blade is None:
         return
-    count = len(blade._points)
-    has_room('_points', blade._points, count, 3)
-    has_room('_device_points', blade._device_points, count, 3)
-    within('corners of the blade', blade._corners, n)
-    inside = int(np.count_nonzero(blade._inside))
-    for name in ('_corners', '_parts'):
-        has_room(name, getattr(blade, name), inside, 4)
-    has_room('_inside', blade._inside, count)
-    has_room('_spans', blade._spans, inside)
+    edge, strips = blade._state, blade._strips
+    for name, width in (('points', 3), ('corners', 4), ('weights', 4)):
+        has_room(f'{name} of the edge', getattr(edge, name), POINTS, width)
+    has_room('spans of the edge', edge.spans, POINTS)
+    has_room('hint of the edge', edge.hint, 1)
+    within('corners of the blade', edge.corners, n)
+    has_room('strips of the blade', strips.knots, MAX_STRIPS, 2, KNOTS, 3)
+    has_room('counts of the strips', strips.counts, 2)
+    within('the number of strips', strips.counts, MAX_STRIPS + 1)
     has_room('_device', blade._device, 2, 3)
+    has_room('_moved', blade._moved, POINTS, 3)
     for name in ('_tip', '_edge', '_cut_tip', '_cut_edge', 'force', 'torque'):
         has_room(name, getattr(blade, name), 3)
-    if blade._fracture is not None:
-        has_room('_strips', blade._fracture._strips, 0, 2, KNOTS, 3)

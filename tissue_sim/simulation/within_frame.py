@@ -9,6 +9,7 @@ import numpy as np
 from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
 from cutting_trainer.tissue_sim.contact.tool import ToolContact
+from cutting_trainer.tissue_sim.mesh.locate import NearElements
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 
@@ -49,6 +50,7 @@ class ToolInFrame:
         self._mesh, self._resistance, self._contact = mesh, resistance, contact
         self._way = before, np.array([contact.blade_root, contact.blade_tip])
         self._pushing = pushing
+        self._near = NearElements(mesh.tetrahedra)
         self._opened = mesh.triangles[mesh.triangle_kind == CUT]
         self._positions = positions
         self._kept = None if blade is None else (blade, blade.kept())
@@ -92,8 +94,8 @@ class ToolInFrame:
     def _follow(self, share: float, positions: np.ndarray) -> None:
         assert self.blade is not None
         stiffness = self._contact.stiffness
-        device = self._device(share)
-        self.blade.follow(self._mesh, positions, device, stiffness, self._opened)
+        device, moved = self._device(share), (self._way[1] - self._way[0]) / self.parts
+        self.blade.follow(self._mesh, self._near, self._opened, positions, device, moved, stiffness)
         self.coupling = self.blade.spring(positions, self._way[1], share, stiffness)
 
     def _device(self, share: float) -> np.ndarray:
