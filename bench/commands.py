@@ -278,6 +278,18 @@ def soak(
     raise typer.Exit(int(run_soak(options)))
 
 
+@app.command('same-cut', epilog=EXIT_STATUSES)
+def same_cut(
+    bag: Annotated[Path, typer.Argument(help='Folder of the bag with the hand.')],
+    runs: Annotated[int, typer.Option(min=2, max=1000, help='How many sessions.')] = 20,
+    as_json: AsJson = False,
+) -> None:
+    """Run a recorded hand live under changing load: the same cut, pieces and bits?"""
+    from bench.trials.same_cut import run_same_cut
+
+    raise typer.Exit(int(run_same_cut(bag, runs, as_json=as_json)))
+
+
 @app.command(epilog=EXIT_STATUSES)
 def faults(
     count: Annotated[int, typer.Option(min=1, help='How many faults.')] = 60,
