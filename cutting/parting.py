@@ -1,12 +1,14 @@
 """Parting of tissue along faces of the mesh near a surface, by a least cut."""
 
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cutting_trainer.cutting.geometry import orientation
+from cutting_trainer.cutting.least_cut import connected, least_cut
 from cutting_trainer.cutting.state_table import outer_bits_of
+from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, interpolated
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
@@ -21,6 +23,8 @@ _ASIDE = 0.25
 """Distance aside of the surface up to which an element is judged, in edges."""
 _ADJACENT = 5
 """Times that the elements beside the region are added to it."""
+_BLOCK = 8
+"""Points of a surface that are passed over together if they are too far away."""
 
 
 class Surface(NamedTuple):
@@ -30,74 +34,199 @@ class Surface(NamedTuple):
     normals: Floats
 
 
-class _Local(NamedTuple):
-    """Elements near a junction as they are after the batch.
+class Local(NamedTuple):
+    """Elements near a place as they are after a batch.
 
     Attributes:
-        corners: nodes; new ones count on from the mesh's, shape (k, 4).
+        nodes: in the mesh; new ones count on from it; sorted, shape (j,).
+        rest: of these nodes [m], shape (j, 3).
+        corners: rows of nodes, shape (k, 4).
         number: in the mesh, or -1 - number in the batch, shape (k,).
-        rest: of all nodes [m], shape (n + a, 3).
-        across: element behind each face, or -1, shape (k, 4).
+        across: face 4 e + f behind each face, or -1, shape (k, 4).
     """
 
+    nodes: Ints
+    rest: Floats
     corners: Ints
     number: Ints
-    rest: Floats
     across: Ints
+
+
+@kernel
+def _nearest(points, places):
+    """Return the nearest point of some, and its distance [m], by place."""
+    blocks = (len(points) + _BLOCK - 1) // _BLOCK
+    middle, radius = np.empty((blocks, 3)), np.zeros(blocks)
+    for block in range(blocks):
+        own = points[block * _BLOCK : (block + 1) * _BLOCK]
+        for i in range(3):
+            middle[block, i] = (own[:, i].min() + own[:, i].max()) / 2
+        for point in own:
+            radius[block] = max(radius[block], np.sqrt(_square(point, middle[block])))
+    nearest, distance = np.empty(len(places), np.int64), np.empty(len(places))
+    row = 0
+    for k in range(len(places)):
+        best = _square(points[row], places[k])
+        length = np.sqrt(best)
+        for block in range(blocks):
+            if _square(middle[block], places[k]) > (length * (1 + 1e-9) + radius[block]) ** 2:
+                continue
+            for p in range(block * _BLOCK, min((block + 1) * _BLOCK, len(points))):
+                square = _square(points[p], places[k])
+                if square < best or (square == best and p < row):
+                    best, row = square, p
+                    length = np.sqrt(best)
+        nearest[k], distance[k] = row, length
+    return nearest, distance
+
+
+@inner
+def _square(a, b):
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return x * x + y * y + z * z
 
 
 def nearest_points(surface: Surface, places: Floats) -> tuple[Ints, Floats]:
     """Return the nearest point of a surface, and its distance [m], by place."""
-    squares = (places**2).sum(axis=1)[:, None] + (surface.points**2).sum(axis=1)
-    squares -= 2 * places @ surface.points.T
-    nearest = squares.argmin(axis=1)
-    return nearest, np.linalg.norm(places - surface.points[nearest], axis=1)
+    nearest, distance = _nearest(surface.points, places)
+    return nearest, distance
 
 
-def _local(mesh: TetMesh, delta: TopologyDelta, seeds: Ints, line: Floats, h: float) -> _Local:
-    """Return the elements near a line, as they are after a batch."""
-    new = interpolated(mesh.rest, delta.node_parents, delta.node_weights)
-    rest = np.concatenate([mesh.rest, new])
-    rest[delta.moved_nodes] = interpolated(mesh.rest, delta.moved_parents, delta.moved_weights)
-    near = _distance_to(line, mesh.rest[seeds]) < _REGION * h
-    gone = set(np.asarray(delta.removed_tetrahedra).tolist())
-    links = mesh.links
-    nodes = set(seeds[near].tolist())
-    found: set[int] = set()
-    for _ in range(_ADJACENT):
-        fresh: list[int] = []
-        for node in nodes:
-            corner = int(links.first_corner[node])
-            while corner >= 0:
-                if corner // 4 not in found:
-                    found.add(corner // 4)
-                    fresh.append(corner // 4)
-                corner = int(links.corner_next[corner])
-        inside = links.tetrahedra[fresh] if fresh else np.zeros((0, 4), np.int64)
-        inside = inside[_distance_to(line, mesh.rest[inside].mean(axis=1)) < _REGION * h]
-        nodes = set(inside.ravel().tolist())
-    old = np.array(sorted(found - gone), np.int64)
-    corners = np.concatenate([links.tetrahedra[old], delta.tetrahedra]).astype(np.int64)
-    number = np.concatenate([old, -1 - np.arange(len(delta.tetrahedra))])
-    return _Local(corners, number, rest, _across(corners))
+def heights(surface: Surface, places: Floats) -> tuple[Floats, Floats]:
+    """Return the heights of places above a surface, and their distances aside of it [m]."""
+    nearest, distance = nearest_points(surface, places)
+    away = places - surface.points[nearest]
+    height: Floats = (away * surface.normals[nearest]).sum(axis=1)
+    return height, np.sqrt(np.maximum(distance**2 - height**2, 0.0))
 
 
-def _distance_to(line: Floats, places: Floats) -> Floats:
+@inner
+def _from_line(line, place):
+    """Return the distance of a place from a segment [m]."""
+    along = length = square = 0.0
+    for i in range(3):
+        way = line[1, i] - line[0, i]
+        along += way * (place[i] - line[0, i])
+        length += way * way
+    share = min(max(along / max(length, 1e-300), 0.0), 1.0)
+    for i in range(3):
+        square += (place[i] - line[0, i] - share * (line[1, i] - line[0, i])) ** 2
+    return np.sqrt(square)
+
+
+@kernel
+def _distances(line, places):
     """Return distances from a segment [m], shape (k,)."""
-    way = line[1] - line[0]
-    share = ((places - line[0]) @ way / max(float(way @ way), 1e-300)).clip(0.0, 1.0)
-    distance: Floats = np.linalg.norm(places - line[0] - share[:, None] * way, axis=1)
-    return distance
+    found = np.empty(len(places))
+    for k in range(len(places)):
+        found[k] = _from_line(line, places[k])
+    return found
 
 
-def _across(corners: Ints) -> Ints:
-    faces = np.sort(corners[:, FACE_NODES].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
-    across = np.full(len(faces), -1)
-    one, two = order[:-1][same], order[1:][same]
-    across[one], across[two] = two // 4, one // 4
-    return across.reshape(-1, 4)
+@kernel
+def _gather(links, rest, seeds, removed, line, region, rings):
+    """Return the numbers of the elements around some nodes near a segment, sorted.
+
+    Args:
+        links: connectivity of the mesh.
+        rest: of its nodes [m], shape (n, 3).
+        seeds: nodes where the search begins, shape (k,).
+        removed: elements to be left out, shape (r,).
+        line: the segment [m], shape (2, 3).
+        region: largest distance from it of a seed, and of an element beyond which the search goes
+            on [m].
+        rings: steps of the search, from element to element.
+    """
+    known, nodes = {np.int64(-1)}, {np.int64(-1)}
+    found = [np.int64(0) for _ in range(0)]
+    queue = [np.int64(0) for _ in range(0)]
+    for tet in removed:
+        known.add(np.int64(tet))
+    for k in range(len(seeds)):
+        node = np.int64(seeds[k])
+        if node not in nodes and _from_line(line, rest[node]) < region:
+            nodes.add(node)
+            queue.append(node)
+    middle = np.empty(3)
+    begin = 0
+    for _ in range(rings):
+        end = len(queue)
+        for k in range(begin, end):
+            corner = links.first_corner[queue[k]]
+            while corner >= 0:
+                tet = np.int64(corner // 4)
+                corner = links.corner_next[corner]
+                if tet in known:
+                    continue
+                known.add(tet)
+                found.append(tet)
+                middle[:] = 0.0
+                for i in range(4):
+                    middle += rest[links.tetrahedra[tet, i]] / 4
+                if _from_line(line, middle) >= region:
+                    continue
+                for i in range(4):
+                    node = np.int64(links.tetrahedra[tet, i])
+                    if node not in nodes:
+                        nodes.add(node)
+                        queue.append(node)
+        begin = end
+    return np.sort(np.array(found, np.int64))
+
+
+@kernel
+def _match(corners, count):
+    """Return the face behind each face, or -1, shape (k, 4).
+
+    Args:
+        corners: of elements, numbers below `count`, shape (k, 4).
+        count: number of nodes.
+    """
+    across = np.full((len(corners), 4), -1, np.int64)
+    first, following = np.full(count, -1, np.int64), np.full(4 * len(corners), -1, np.int64)
+    ends = np.empty((4 * len(corners), 3), np.int64)
+    for face in range(4 * len(corners)):
+        e, f = face // 4, face % 4
+        a, b = corners[e, FACE_NODES[f, 0]], corners[e, FACE_NODES[f, 1]]
+        c = corners[e, FACE_NODES[f, 2]]
+        low, high = min(a, b, c), max(a, b, c)
+        ends[face, 0], ends[face, 1], ends[face, 2] = low, a + b + c - low - high, high
+        other, before = first[low], np.int64(-1)
+        while other >= 0 and not (
+            ends[other, 1] == ends[face, 1] and ends[other, 2] == ends[face, 2]
+        ):
+            before, other = other, following[other]
+        if other < 0:
+            following[face] = first[low]
+            first[low] = face
+            continue
+        across[e, f], across[other // 4, other % 4] = other, face
+        if before < 0:
+            first[low] = following[other]
+        else:
+            following[before] = following[other]
+    return across
+
+
+def local_elements(
+    mesh: TetMesh, delta: TopologyDelta, seeds: Ints, line: Floats, region: float, rings: int
+) -> Local:
+    """Return the elements near a segment as they are after a batch, and all that it has made."""
+    removed = np.ascontiguousarray(delta.removed_tetrahedra)
+    old = _gather(mesh.links, mesh.rest, seeds, removed, line, region, rings)
+    number = np.concatenate([old, -1 - np.arange(len(delta.tetrahedra))])
+    corners = np.concatenate([mesh.links.tetrahedra[old], delta.tetrahedra])
+    nodes, rows = np.unique(corners, return_inverse=True)
+    corners = np.ascontiguousarray(rows.reshape(-1, 4), np.int64)
+    rest = np.empty((len(nodes), 3))
+    first_new = int(np.searchsorted(nodes, mesh.node_count))
+    rest[:first_new] = mesh.rest[nodes[:first_new]]
+    new = nodes[first_new:] - mesh.node_count
+    rest[first_new:] = interpolated(mesh.rest, delta.node_parents[new], delta.node_weights[new])
+    at = np.searchsorted(nodes, delta.moved_nodes)
+    here = np.flatnonzero(nodes[at.clip(max=len(nodes) - 1)] == delta.moved_nodes)
+    rest[at[here]] = interpolated(mesh.rest, delta.moved_parents[here], delta.moved_weights[here])
+    return Local(nodes, rest, corners, number, _match(corners, len(nodes)))
 
 
 def part_along(
@@ -123,166 +252,216 @@ def part_along(
     """
     area = 0.0
     for line in lines:
-        local = _local(mesh, delta, nodes, line, h)
-        faces = _least_cut(local, surface, line, h)
+        local = local_elements(mesh, delta, nodes, line, _REGION * h, _ADJACENT)
+        near = _distances(line, centres_of(local)) < _REGION * h
+        height = judged_heights(local, surface, near, h)
+        judged = np.abs(height) < 1.5 * h
+        faces = least_faces(local, surface, judged, height > _CLEAR * h, height < -_CLEAR * h, h)
         if len(faces):
-            delta, more = _open(mesh, delta, local, faces)
+            delta, more = open_faces(mesh, delta, local, faces)
             area += more
     return delta, area
 
 
-def _least_cut(local: _Local, surface: Surface, line: Floats, h: float) -> Ints:
-    """Return the faces to be opened, as element and face, shape (f, 2)."""
-    centres = local.rest[local.corners].mean(axis=1)
-    nearest, distance = nearest_points(surface, centres)
-    height = ((centres - surface.points[nearest]) * surface.normals[nearest]).sum(axis=1)
-    aside = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
-    judged = (aside < _ASIDE * h) & (np.abs(height) < 1.5 * h)
-    judged &= _distance_to(line, centres) < _REGION * h
-    sources = np.flatnonzero(judged & (height > _CLEAR * h))
-    sinks = set(np.flatnonzero(judged & (height < -_CLEAR * h)).tolist())
-    across = np.where(judged[local.across] & (local.across >= 0), local.across, -1)
-    across[~judged] = -1
-    if not len(sources) or _way(across, sources.tolist(), sinks, {}) is None:
-        return np.zeros((0, 2), np.int64)
-    elements, face = np.nonzero(across >= 0)
-    middle = local.rest[local.corners[elements[:, None], FACE_NODES[face]]].mean(axis=1)
-    nearest, _ = nearest_points(surface, middle)
-    off = np.abs(((middle - surface.points[nearest]) * surface.normals[nearest]).sum(axis=1)) / h
-    cost = 1 + np.round(40.0 * off**2).astype(np.int64)
-    return _flow(across, sources.tolist(), sinks, elements, face, cost)
+def centres_of(local: Local) -> Floats:
+    """Return the centres of elements at rest [m], shape (k, 3)."""
+    centres: Floats = local.rest[local.corners].mean(axis=1)
+    return centres
 
 
-def _flow(
-    across: Ints, sources: list[int], sinks: set[int], elements: Ints, face: Ints, cost: Ints
+def judged_heights(local: Local, surface: Surface, near: NDArray[np.bool_], h: float) -> Floats:
+    """Return the heights of elements above a surface [m], NaN aside of it, shape (k,).
+
+    Args:
+        local: the elements.
+        surface: points and normals.
+        near: elements that are looked at, shape (k,).
+        h: length of an edge [m].
+    """
+    height = np.full(len(near), np.nan)
+    above, aside = heights(surface, centres_of(local)[near])
+    height[near] = np.where(aside < _ASIDE * h, above, np.nan)
+    return height
+
+
+def least_faces(
+    local: Local,
+    surface: Surface,
+    judged: NDArray[np.bool_],
+    sources: NDArray[np.bool_],
+    sinks: NDArray[np.bool_],
+    h: float,
 ) -> Ints:
-    """Return the faces of a least cut (Edmonds and Karp), shape (f, 2)."""
-    pairs = zip(elements.tolist(), face.tolist(), strict=True)
-    ends = [(e, int(across[e, f])) for e, f in pairs]
-    room = dict(zip(ends, cost.tolist(), strict=True))
-    for _ in range(10 * len(room)):
-        way = _way(across, sources, sinks, room)
-        if way is None:
-            break
-        least = min(room[step] for step in way)
-        for a, b in way:
-            room[a, b] -= least
-            room[b, a] += least
-    reached = _reached(across, sources, room)
-    return np.array(
-        [
-            (e, f)
-            for (e, to), f in zip(ends, face.tolist(), strict=True)
-            if e in reached and to not in reached
-        ],
-        np.int64,
-    ).reshape(-1, 2)
+    """Return the faces that part some elements from others, as near to a surface as may be.
+
+    Args:
+        local: all elements.
+        surface: near which to part them.
+        judged: elements through which they may be connected, shape (k,).
+        sources, sinks: those to be parted, where judged, shape (k,).
+        h: length of an edge [m].
+
+    Returns:
+        4 e + f, shape (f,).
+    """
+    sources, sinks = sources & judged, sinks & judged
+    across = np.where(judged[local.across // 4] & (local.across >= 0), local.across, -1)
+    across[~judged] = -1
+    if not connected(across, sources, sinks):
+        return np.zeros(0, np.int64)
+    cost = np.ones((len(across), 4), np.int64)
+    one = np.flatnonzero(across.ravel() > np.arange(across.size))
+    other = across.ravel()[one]
+    middle = local.rest[local.corners[one[:, None] // 4, FACE_NODES[one % 4]]].mean(axis=1)
+    off = np.abs(heights(surface, middle)[0]) / h
+    cost.ravel()[one] = cost.ravel()[other] = 1 + np.round(40.0 * off**2).astype(np.int64)
+    kept = least_cut(across, cost, sources, sinks)
+    behind = (across >= 0) & ~kept[across // 4]
+    faces: Ints = np.flatnonzero(kept[:, None] & behind)
+    return faces
 
 
-def _reached(across: Ints, sources: list[int], room: dict[tuple[int, int], int]) -> dict[int, int]:
-    """Return the element before each one that can be reached."""
-    before = dict.fromkeys(sources, -1)
-    queue = deque(sources)
-    while queue:
-        at = queue.popleft()
-        for to in across[at].tolist():
-            if to >= 0 and to not in before and room.get((at, to), 1) > 0:
-                before[to] = at
-                queue.append(to)
-    return before
+@kernel
+def _split(faces, across, corners, volumes, whole):
+    """Give a node of its own to each part of the elements around a node that some faces part.
 
+    Args:
+        faces: that are opened, 4 e + f, shape (f,).
+        across, corners: of the elements, shape (k, 4); both are changed.
+        volumes: of the elements, shape (k,).
+        whole: nodes all of whose elements are at hand, shape (j,).
 
-def _way(
-    across: Ints, sources: list[int], sinks: set[int], room: dict[tuple[int, int], int]
-) -> list[tuple[int, int]] | None:
-    """Return the steps of a shortest way from the sources to the sinks, if there is one."""
-    before = _reached(across, sources, room)
-    at = next((element for element in before if element in sinks), None)
-    if at is None:
-        return None
-    way = []
-    while before[at] >= 0:
-        way.append((before[at], at))
-        at = before[at]
-    return way
-
-
-def _open(
-    mesh: TetMesh, delta: TopologyDelta, local: _Local, faces: Ints
-) -> tuple[TopologyDelta, float]:
-    """Open faces, and give a node to each part of the elements around a node that they part."""
-    corners, across = local.corners.copy(), local.across.copy()
-    for element, face in faces.tolist():
-        other = across[element, face]
-        across[other, across[other] == element] = -1
-        across[element, face] = -1
-    nodes = np.unique(local.corners[faces[:, :1], FACE_NODES[faces[:, 1]]])
-    volume = _volumes(local)
-    copies: list[int] = []
-    first = len(local.rest)
-    for node in nodes.tolist():
-        if not _is_whole(mesh, delta, local, node):
+    Returns:
+        The node of which each further node, from j on, is a copy.
+    """
+    count = len(whole)
+    concerned = np.zeros(count, np.bool_)
+    for face in faces:
+        other = across[face // 4, face % 4]
+        across[face // 4, face % 4] = across[other // 4, other % 4] = -1
+        for i in range(3):
+            concerned[corners[face // 4, FACE_NODES[face % 4, i]]] = True
+    first, following = np.full(count, -1, np.int64), np.empty(4 * len(corners), np.int64)
+    for corner in range(4 * len(corners) - 1, -1, -1):
+        node = corners[corner // 4, corner % 4]
+        following[corner] = first[node]
+        first[node] = corner
+    part = np.full(4 * len(corners), -1, np.int64)
+    copies = [np.int64(0) for _ in range(0)]
+    for node in range(count):
+        if not (concerned[node] and whole[node]):
             continue
-        parts = _parts(local.corners, across, node)
-        parts.sort(key=lambda part: -volume[part].sum())
-        for part in parts[1:]:
-            rows = np.array(part)
-            corners[rows[:, None], np.arange(4)] = np.where(
-                local.corners[rows] == node, first + len(copies), corners[rows]
-            )
-            copies.append(node)
-    if not copies:
-        return delta, 0.0
-    area = 0.0
-    for element, face in faces.tolist():
-        other = local.across[element, face]
-        own, its = corners[element, FACE_NODES[face]], corners[other]
-        if not np.isin(own, its).all():
-            a, b, c = local.rest[local.corners[element, FACE_NODES[face]]]
-            area += float(np.linalg.norm(np.cross(b - a, c - a))) / 2
-    return _with_copies(mesh, delta, local, corners, np.array(copies)), area
+        sizes = [0.0 for _ in range(0)]
+        start = first[node]
+        while start >= 0:
+            if part[start] < 0:
+                sizes.append(_flood(start, len(sizes), node, across, corners, volumes, part))
+            start = following[start]
+        order = np.argsort(-np.array(sizes), kind='mergesort')
+        number = np.empty(len(order), np.int64)
+        for k in range(len(order)):
+            number[order[k]] = node if k == 0 else count + len(copies)
+            if k > 0:
+                copies.append(np.int64(node))
+        corner = first[node]
+        while corner >= 0:
+            corners[corner // 4, corner % 4] = number[part[corner]]
+            corner = following[corner]
+    return np.array(copies, np.int64)
 
 
-def _volumes(local: _Local) -> Floats:
-    a, b, c, d = (local.rest[local.corners[:, i]] for i in range(4))
-    volumes: Floats = np.einsum('ij,ij->i', np.cross(b - a, c - a), d - a)
+@inner
+def _flood(start, number, node, across, corners, volumes, part):
+    """Number the corners at a node that faces with the node connect with one; return the volume
+    of their elements [m^3].
+    """
+    queue = [start]
+    part[start] = number
+    volume = 0.0
+    while len(queue) > 0:
+        corner = queue.pop()
+        element = corner // 4
+        volume += volumes[element]
+        for face in range(4):
+            other = across[element, face] // 4
+            if face == corner % 4 or other < 0:
+                continue
+            for i in range(4):
+                if corners[other, i] == node and part[4 * other + i] < 0:
+                    part[4 * other + i] = number
+                    queue.append(4 * other + i)
+    return volume
+
+
+@kernel
+def _whole(nodes, corners, number, links, removed):
+    """Return which nodes have all their elements at hand, shape (j,)."""
+    missing = np.zeros(len(nodes), np.int64)
+    for e in range(len(corners)):
+        if number[e] >= 0:
+            for i in range(4):
+                missing[corners[e, i]] -= 1
+    gone = {np.int64(-1)}
+    for tet in removed:
+        gone.add(np.int64(tet))
+    for k in range(len(nodes)):
+        if nodes[k] < len(links.first_corner):
+            corner = links.first_corner[nodes[k]]
+            while corner >= 0:
+                missing[k] += np.int64(corner // 4) not in gone
+                corner = links.corner_next[corner]
+    return missing == 0
+
+
+@kernel
+def _volumes(rest, corners):
+    """Return six times the volumes of some elements [m^3], shape (k,)."""
+    volumes = np.empty(len(corners))
+    for k in range(len(corners)):
+        a, b, c, d = corners[k]
+        volumes[k] = orientation(rest[a], rest[b], rest[c], rest[d])
     return volumes
 
 
-def _is_whole(mesh: TetMesh, delta: TopologyDelta, local: _Local, node: int) -> bool:
-    """Return whether all elements around a node are at hand."""
-    if node >= mesh.node_count:
-        return True
-    around = set()
-    corner = int(mesh.links.first_corner[node])
-    while corner >= 0:
-        around.add(corner // 4)
-        corner = int(mesh.links.corner_next[corner])
-    around -= set(np.asarray(delta.removed_tetrahedra).tolist())
-    return around <= set(local.number[(local.corners == node).any(axis=1)].tolist())
-
-
-def _parts(corners: Ints, across: Ints, node: int) -> list[list[int]]:
-    """Return the parts of the elements around a node that faces with the node connect."""
-    left = set(np.flatnonzero((corners == node).any(axis=1)).tolist())
-    parts = []
-    while left:
-        queue = [min(left)]
-        left.discard(queue[0])
-        for at in queue:
-            for face in range(4):
-                to = int(across[at, face])
-                if corners[at, face] != node and to in left:
-                    left.discard(to)
-                    queue.append(to)
-        parts.append(queue)
-    return parts
+def open_faces(
+    mesh: TetMesh, delta: TopologyDelta, local: Local, faces: Ints
+) -> tuple[TopologyDelta, float]:
+    """Open faces, and give a node to each part of the elements around a node that they part."""
+    corners = local.corners.copy()
+    volumes = _volumes(local.rest, local.corners)
+    removed = np.ascontiguousarray(delta.removed_tetrahedra)
+    whole = _whole(local.nodes, local.corners, local.number, mesh.links, removed)
+    copies = _split(faces, local.across.copy(), corners, volumes, whole)
+    if not len(copies):
+        return delta, 0.0
+    own = corners[faces[:, None] // 4, FACE_NODES[faces % 4]]
+    its = corners[local.across.ravel()[faces] // 4]
+    opened = faces[~(own[:, :, None] == its[:, None]).any(axis=2).all(axis=1)]
+    a, b, c = np.moveaxis(
+        local.rest[local.corners[opened[:, None] // 4, FACE_NODES[opened % 4]]], 1, 0
+    )
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    first = mesh.node_count + len(delta.node_parents)
+    numbers = np.concatenate([local.nodes, np.arange(first, first + len(copies))])
+    changed = (corners != local.corners).any(axis=1)
+    delta = _with_copies(
+        mesh, delta, local.number[changed], numbers[corners[changed]], local.nodes[copies]
+    )
+    return delta, area
 
 
 def _with_copies(
-    mesh: TetMesh, delta: TopologyDelta, local: _Local, corners: Ints, copies: Ints
+    mesh: TetMesh, delta: TopologyDelta, number: Ints, corners: Ints, copies: Ints
 ) -> TopologyDelta:
-    """Return a batch with further copies of nodes."""
+    """Return a batch with further copies of nodes.
+
+    Args:
+        mesh: before the batch.
+        delta: the batch.
+        number: of the elements that use them, see `Local`, shape (k,).
+        corners: of these elements, shape (k, 4).
+        copies: the originals, shape (c,).
+    """
     n = mesh.node_count
     parents = np.repeat(copies[:, None], 4, axis=1)
     weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(copies), 1))
@@ -293,12 +472,10 @@ def _with_copies(
     )
     row, slid = np.nonzero(copies[:, None] == np.asarray(delta.moved_nodes))
     parents[row], weights[row] = delta.moved_parents[slid], delta.moved_weights[slid]
-    changed = (corners != local.corners).any(axis=1)
-    old = changed & (local.number >= 0)
-    stayed = local.number[old]
+    old = number >= 0
     tetrahedra = delta.tetrahedra.copy()
-    mine = changed & (local.number < 0)
-    tetrahedra[-1 - local.number[mine]] = corners[mine]
+    tetrahedra[-1 - number[~old]] = corners[~old]
+    stayed = number[old]
     return TopologyDelta(
         node_parents=np.concatenate([delta.node_parents, parents]),
         node_weights=np.concatenate([delta.node_weights, weights]),

@@ -6,9 +6,11 @@ import numpy as np
 
 from cutting_trainer.cutting.lookup import empty_tables, with_room
 from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.parting import Surface, part_along
 from cutting_trainer.cutting.settings import CuttingSettings
 from cutting_trainer.cutting.state_table import block, put_on_cut
 from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.warm_up import small_cube
 
 
@@ -23,7 +25,19 @@ def warm_up(settings: CuttingSettings) -> None:
         if not result.delta.empty:
             mesh.apply(result.delta)
     method.finish(mesh, mesh.rest)
+    _part(small_cube())
     # Of elements that are too flat to be divided: the cube has none.
     tables = with_room(empty_tables(), mesh_nodes=1, tetrahedra=1, nodes=1, edges=1, parents=1)
     put_on_cut(tables, 0, np.zeros(0, np.int64), mesh.rest)
     block(tables, 0, np.zeros(0, np.int64))
+
+
+def _part(mesh: TetMesh) -> None:
+    """Part a cube along its middle, as strokes do that leave tissue between them."""
+    size, middle = float(np.ptp(mesh.rest)), mesh.rest.mean(axis=0)
+    share = np.linspace(-0.6, 0.6, 13)
+    points = middle + size * np.stack(np.meshgrid(0.0, share, share), axis=-1).reshape(-1, 3)
+    normals = np.tile([1.0, 0.0, 0.0], (len(points), 1))
+    line = middle + size * np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]])
+    nodes = np.arange(mesh.node_count)
+    part_along(mesh, TopologyDelta(), nodes, Surface(points, normals), line[None], 0.5 * size)
