@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from cutting_trainer.cutting.batch import CutStateError, Scheme, build_batch, give_up_edges
+from cutting_trainer.cutting.bridges import part_bridges
 from cutting_trainer.cutting.broad_phase import quad
 from cutting_trainer.cutting.crossings import find_hits, lengthened, met_tetrahedra, surfaces
 from cutting_trainer.cutting.geometry import smallest_altitudes
@@ -30,6 +31,7 @@ _EDGE = 1.5
 """Edge of a well-shaped element, in altitudes."""
 _ENOUGH = 20000
 """Elements in the sample for a median."""
+_HOLDS = 'the tissue holds together across the cut at ({:.1f}, {:.1f}, {:.1f}) mm at rest'
 FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
 
 
@@ -109,8 +111,9 @@ class CombinedMethod:
         if folded:
             warnings.append(FOLDED)
         if finish or folded:
-            delta, more = self._join_strokes(mesh, delta)
+            delta, more, said = self._join_strokes(mesh, delta)
             area += more
+            warnings += said
             self._empty_tables(mesh, delta.node_parents.shape[0])
         further = len(delta.node_parents) - len(batch.delta.node_parents)
         self._size = (batch.size[0] + further, batch.size[1])
@@ -142,20 +145,25 @@ class CombinedMethod:
         if way > 0.2 * _EDGE * self._altitude:
             self._lines = np.concatenate([self._lines, edge[None]])
 
-    def _join_strokes(self, mesh: TetMesh, delta: TopologyDelta) -> tuple[TopologyDelta, float]:
-        """Part the tissue where this stroke meets the ends of earlier ones; remember its ends."""
+    def _join_strokes(
+        self, mesh: TetMesh, delta: TopologyDelta
+    ) -> tuple[TopologyDelta, float, list[str]]:
+        """Part the tissue that this stroke has left, also where it meets the ends of earlier ones;
+        remember its ends.
+        """
         h = _EDGE * self._altitude
         lines, self._lines = self._lines, self._lines[:0]
         if not self._scheme.reach or len(lines) < 2:
-            return delta, 0.0
+            return delta, 0.0, []
+        delta, area, places = part_bridges(mesh, delta, self._tables, self._first_new, lines, h)
         ends = []
         for one in (lines, lines[::-1]):
             way = np.cumsum(np.linalg.norm(np.diff(one, axis=0), axis=2).mean(axis=1))
             ends.append(np.ascontiguousarray(one[: 2 + int(np.searchsorted(way, _STRIP * h))]))
         nodes = self._tables.node_id[: self._tables.counts[NODES]]
-        delta, area = part_junctions(mesh, delta, nodes, ends, self._strips, h)
+        delta, more = part_junctions(mesh, delta, nodes, ends, self._strips, h)
         self._strips = [*self._strips, *ends][-_MAX_STRIPS:]
-        return delta, area
+        return delta, area + more, [_HOLDS.format(*1e3 * place) for place in places[:1]]
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
         """Lead the cut on by the reach, where a stroke ends inside the tissue."""

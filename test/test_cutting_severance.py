@@ -50,12 +50,11 @@ def test_a_bridge_is_found_where_one_is(plate):
     cut = circle(plate, 4, np.random.default_rng(0))
     path = cut.paths[0]
     gap = len(path) // 2
-    torn = Cut((path[:gap], path[gap + 12 :]), False, cut.inside, cut.radius)
-    whole = Cut((path,), True, cut.inside, cut.radius)
+    torn = Cut((path[:gap], path[gap + 12 :]))
     mesh, _, error = cut_mesh(plate, torn)
     assert error == ''
-    assert not plug_is_free(mesh, whole, plate.h)
-    assert bridges_of(mesh, whole, plate.h)[1] > 0
+    assert not plug_is_free(mesh, cut, plate.h)
+    assert bridges_of(mesh, cut, plate.h)[1] > 0
 
 
 def test_four_lines_free_a_square(plate):
@@ -104,6 +103,12 @@ def test_a_crossing_around_the_blade_may_end_at_a_node_put_on_the_cut(cloud, see
     """A flat element puts its node on the cut, while the blade is still in another of its edges."""
     run = measure(cloud, curved(cloud, 'spiral', np.random.default_rng(seed)))
     assert run.error == '' and run.faces == 0
+
+
+def test_elements_with_all_nodes_on_the_cut_leave_no_bridge(cloud):
+    """Each is given a side by itself: the faces between them need not close the cut."""
+    run = measure(cloud, four_arcs(cloud, 6, np.random.default_rng(18)))
+    assert run.error == '' and run.faces == 0 and run.said == ()
 
 
 def test_a_face_off_the_swept_surface_is_opened():
