@@ -102,13 +102,15 @@ class Cut:
         paths: the blade's edge, root and tip, by step [m], each shape (k, 2, 3).
         closed: the cut closes on itself: its ends are not free.
         inside: point of the plug that has to come free [m], shape (3,); None without one.
-        radius: of the circle around the plug [m].
+        radius: of the circle in the plug [m].
+        beyond: of the circle around it [m].
     """
 
     paths: tuple[Floats, ...]
     closed: bool = False
     inside: Floats | None = None
     radius: float = 0.0
+    beyond: float = 0.0
 
 
 def _upright(organ: Organ, line: Floats, depth: float | None, tilt: Floats) -> Floats:
@@ -145,7 +147,7 @@ def circle(organ: Organ, ratio: float, rng: np.random.Generator) -> Cut:
     turn = np.linspace(start, start + 2 * np.pi * (1 + OVERLAP), 2000)
     line = centre + radius * np.column_stack([np.cos(turn), np.sin(turn)])
     path = _upright(organ, _resampled(line, STEP * organ.h), None, np.zeros(2))
-    return Cut((path,), True, np.append(centre, organ.middle[2]), radius)
+    return Cut((path,), True, np.append(centre, organ.middle[2]), radius, radius)
 
 
 def four_arcs(organ: Organ, ratio: float, rng: np.random.Generator) -> Cut:
@@ -159,7 +161,7 @@ def four_arcs(organ: Organ, ratio: float, rng: np.random.Generator) -> Cut:
         turn = start + k * np.pi / 2 + np.linspace(-half, half, 500)
         line = centre + radius * np.column_stack([np.cos(turn), np.sin(turn)])
         paths.append(_upright(organ, _resampled(line, STEP * organ.h), None, np.zeros(2)))
-    return Cut(tuple(paths), True, np.append(centre, organ.middle[2]), radius)
+    return Cut(tuple(paths), True, np.append(centre, organ.middle[2]), radius, radius)
 
 
 def four_lines(organ: Organ, ratio: float, rng: np.random.Generator) -> Cut:
@@ -174,7 +176,8 @@ def four_lines(organ: Organ, ratio: float, rng: np.random.Generator) -> Cut:
         way = np.array([-1.0, 1.0])[:, None] * (radius + 0.7 * organ.h)
         line = centre + radius * out + way * along
         paths.append(_upright(organ, _resampled(line, STEP * organ.h), None, np.zeros(2)))
-    return Cut(tuple(paths), True, np.append(centre, organ.middle[2]), radius)
+    inside = np.append(centre, organ.middle[2])
+    return Cut(tuple(paths), True, inside, radius, np.sqrt(2) * radius)
 
 
 def _turned(line: Floats, organ: Organ, rng: np.random.Generator) -> Floats:

@@ -218,7 +218,9 @@ def _reachable(graph: csr_array, start: int) -> NDArray[np.bool_]:
 
 
 def plug_is_free(mesh: TetMesh, cut: Cut, h: float) -> bool:
-    """Return whether the inside of a closed cut hangs together with nothing outside."""
+    """Return whether the inside of a closed cut hangs together with nothing outside; also if the
+    tissue ends within an edge of the cut.
+    """
     if cut.inside is None:
         return True
     tet, face = np.nonzero(mesh.neighbors >= 0)
@@ -229,7 +231,7 @@ def plug_is_free(mesh: TetMesh, cut: Cut, h: float) -> bool:
     _, part = connected_components(graph, directed=False)
     centres = mesh.rest[mesh.tetrahedra].mean(axis=1)
     away = np.linalg.norm((centres - cut.inside)[:, :2], axis=1)
-    inner, outer = away < 0.5 * cut.radius, away > np.sqrt(2) * cut.radius + h
+    inner, outer = away < 0.5 * cut.radius, away > cut.beyond + h
     return len(np.intersect1d(part[inner], part[outer])) == 0
 
 
