@@ -1,8 +1,8 @@
 """Bridges: tissue that hangs on across the surface that a stroke has swept.
 
 An element whose nodes are all on the cut, though not all of them on the swept surface, is given a
-side by itself; the faces between such elements need not close the cut. At the end of a stroke, what
-still connects its two sides is parted by a least cut.
+side by itself; the faces between such elements need not close the cut. At the end of a stroke, the
+tissue that still connects its two sides is parted by a least cut.
 """
 
 import numpy as np

@@ -8,6 +8,7 @@ from cutting_trainer.cutting.batch import CutStateError, Scheme, build_batch, gi
 from cutting_trainer.cutting.bridges import part_bridges
 from cutting_trainer.cutting.broad_phase import quad
 from cutting_trainer.cutting.crossings import find_hits, lengthened, met_tetrahedra, surfaces
+from cutting_trainer.cutting.front import slide_front
 from cutting_trainer.cutting.geometry import smallest_altitudes
 from cutting_trainer.cutting.junctions import part_junctions
 from cutting_trainer.cutting.lookup import NODES, clear, empty_tables, with_room
@@ -163,6 +164,9 @@ class CombinedMethod:
         nodes = self._tables.node_id[: self._tables.counts[NODES]]
         delta, more = part_junctions(mesh, delta, nodes, ends, self._strips, h)
         self._strips = [*self._strips, *ends][-_MAX_STRIPS:]
+        area += more
+        small = self._limits().small
+        delta, more = slide_front(mesh, delta, nodes, self._first_new, lines, h, small)
         return delta, area + more, [_HOLDS.format(*1e3 * place) for place in places[:1]]
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:

@@ -27,7 +27,7 @@ _BUSY = (sys.executable, '-c', 'while True: pass')
 
 @dataclass(frozen=True)
 class Cut:
-    """What one run has cut.
+    """The cut of one run.
 
     Attributes:
         busy: processes that kept a core busy.
@@ -45,7 +45,7 @@ class Cut:
 
 
 def run_same_cut(hand: Path, runs: int, *, as_json: bool) -> Status:
-    """Run a recorded hand several times, and print what each run has cut.
+    """Run a recorded hand several times, and print the cut of each run.
 
     Args:
         hand: folder of the bag with the hand.
@@ -76,7 +76,7 @@ def run_same_cut(hand: Path, runs: int, *, as_json: bool) -> Status:
 
 
 def failures_of(cuts: list[Cut], spread: float) -> list[str]:
-    """Return what differs between some runs, as sentences.
+    """Return the differences between some runs, as sentences.
 
     Args:
         cuts: of the runs.
