@@ -7,6 +7,7 @@ import numpy as np
 from cutting_trainer.cutting.batch import CutStateError, Scheme, build_batch, give_up_edges
 from cutting_trainer.cutting.bridges import part_bridges
 from cutting_trainer.cutting.broad_phase import quad
+from cutting_trainer.cutting.coverage import closed_area
 from cutting_trainer.cutting.crossings import find_hits, lengthened, met_tetrahedra, surfaces
 from cutting_trainer.cutting.front import slide_front
 from cutting_trainer.cutting.geometry import smallest_altitudes
@@ -33,6 +34,13 @@ _EDGE = 1.5
 _ENOUGH = 20000
 """Elements in the sample for a median."""
 _HOLDS = 'the tissue holds together across the cut at ({:.1f}, {:.1f}, {:.1f}) mm at rest'
+_CLOSED = (
+    'the tissue still holds together where the blade swept {:.2f} cm^2 around '
+    '({:.1f}, {:.1f}, {:.1f}) mm at rest: elements with edges of {:.1f} mm are too large for a cut '
+    'so shallow'
+)
+_MAX_CLOSED = 0.25
+"""Swept area that may stay closed unsaid, in squared edges."""
 FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
 
 
@@ -166,8 +174,12 @@ class CombinedMethod:
         self._strips = [*self._strips, *ends][-_MAX_STRIPS:]
         area += more
         small = self._limits().small
-        delta, more = slide_front(mesh, delta, nodes, self._first_new, lines, h, small)
-        return delta, area + more, [_HOLDS.format(*1e3 * place) for place in places[:1]]
+        delta, more, opened = slide_front(mesh, delta, nodes, self._first_new, lines, h, small)
+        said = [_HOLDS.format(*1e3 * place) for place in places[:1]]
+        closed, middle = closed_area(mesh, lines, opened, h)
+        if closed > _MAX_CLOSED * h**2:
+            said.append(_CLOSED.format(1e4 * closed, *1e3 * middle, 1e3 * h))
+        return delta, area + more, said
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
         """Lead the cut on by the reach, where a stroke ends inside the tissue."""

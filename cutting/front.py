@@ -5,6 +5,8 @@ nodes slide in the rest shape to the nearest place on the path of the blade's en
 elements around them stay well shaped.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,18 @@ _SWEEPS = 3
 """Times that all nodes slide: each makes room for its neighbours."""
 
 
+class Opened(NamedTuple):
+    """Faces that cuts have opened around a stroke.
+
+    Attributes:
+        rest: of their nodes [m], shape (j, 3).
+        triangles: one of the two that lie on each other, shape (f, 3).
+    """
+
+    rest: Floats
+    triangles: Ints
+
+
 def slide_front(
     mesh: TetMesh,
     delta: TopologyDelta,
@@ -33,7 +47,7 @@ def slide_front(
     lines: Floats,
     h: float,
     small: float,
-) -> tuple[TopologyDelta, float]:
+) -> tuple[TopologyDelta, float, Opened]:
     """Let the front of a stroke slide to where the blade has been.
 
     Args:
@@ -47,7 +61,7 @@ def slide_front(
         small: altitude below which no slide makes an element [m].
 
     Returns:
-        The batch with the slides, and the further area [m^2].
+        The batch with the slides, the further area [m^2], and the faces that are open then.
     """
     local = local_elements(mesh, delta, nodes, lines[0], np.inf, 1)
     place = np.unique(local.rest, axis=0, return_inverse=True)[1].ravel()
@@ -58,8 +72,8 @@ def slide_front(
     targets, distance = _nearest_on(_border(lines), local.rest[fronts])
     near = (distance < _FARTHEST * h) & (distance > 1e-3 * h)
     fronts, targets = fronts[near], targets[near]
-    if not len(fronts):
-        return delta, 0.0
+    faces = faces[pairs[:, 0]]
+    opened = local.corners[faces[:, None] // 4, FACE_NODES[faces % 4]]
     rest = local.rest.copy()
     _slide(rest, local.corners, fronts, targets, small)
     fronts = fronts[(rest[fronts] != local.rest[fronts]).any(axis=1)]
@@ -67,12 +81,12 @@ def slide_front(
     lost = found < 0
     rest[fronts[lost]] = local.rest[fronts[lost]]
     fronts, found, weights = fronts[~lost], found[~lost], weights[~lost]
-    if len(fronts) == 0 or (_least_altitudes(rest, local.corners) <= 0.0).any():
-        return delta, 0.0
+    if (_least_altitudes(rest, local.corners) <= 0.0).any():
+        return delta, 0.0, Opened(local.rest, opened)
     parents = mesh.tetrahedra[found].astype(np.int64)
-    opened = local.corners[faces[pairs[:, 0], None] // 4, FACE_NODES[faces[pairs[:, 0]] % 4]]
     further = _areas(rest, opened) - _areas(local.rest, opened)
-    return _with_places(mesh, delta, local.nodes[fronts], parents, weights), further
+    delta = _with_places(mesh, delta, local.nodes[fronts], parents, weights)
+    return delta, further, Opened(rest, opened)
 
 
 def _open_faces(local: Local, place: Ints) -> tuple[Ints, Ints]:

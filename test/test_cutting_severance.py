@@ -163,19 +163,44 @@ def test_the_same_strokes_cut_the_same_mesh(plate):
     assert one.tetrahedra.tobytes() == two.tetrahedra.tobytes()
 
 
+def straight(block: Organ, depth: float, angle: float) -> tuple[Cut, float]:
+    """Stroke through the middle of a block, a depth [h] below its top; with its area [m^2]."""
+    along = np.array([np.cos(angle), np.sin(angle), 0.0])
+    way = np.linspace(-0.035, 0.035, 60)[:, None] * along + block.middle
+    path = np.stack([way, way], axis=1)
+    high, across = block.nodes[:, 2].max(), np.ptp(block.nodes[:, 0])
+    path[:, 0, 2], path[:, 1, 2] = high + 0.003, high - depth * block.h
+    return Cut((path,)), depth * block.h * across / np.abs(along[:2]).max()
+
+
+ANGLES = np.linspace(0.1, 3.0, 8)
+
+
 @pytest.mark.parametrize('depth', [1.0, 2.0])
 def test_the_front_lies_where_the_end_of_the_blade_went(depth):
     """Without its slides, the areas of single strokes spread by 7 and 3.5 per cent."""
     block, ratios = organ_of('block', *good_block((8, 8, 6), 0.005, seed=101)), []
-    high, across = block.nodes[:, 2].max(), np.ptp(block.nodes[:, 0])
-    volume = across**2 * np.ptp(block.nodes[:, 2])
-    for angle in np.linspace(0.1, 3.0, 8):
-        along = np.array([np.cos(angle), np.sin(angle), 0.0])
-        way = np.linspace(-0.035, 0.035, 60)[:, None] * along + block.middle
-        path = np.stack([way, way], axis=1)
-        path[:, 0, 2], path[:, 1, 2] = high + 0.003, high - depth * block.h
-        mesh = cut_mesh(block, Cut((path,)))[0]
-        assert mesh.volumes().sum() == pytest.approx(volume, rel=1e-12)
-        ratios.append(cut_face_area(mesh) / (depth * block.h * across / np.abs(along[:2]).max()))
+    for angle in ANGLES:
+        cut, swept = straight(block, depth, angle)
+        mesh = cut_mesh(block, cut)[0]
+        assert mesh.volumes().sum() == pytest.approx(
+            np.prod(np.ptp(block.nodes, axis=0)), rel=1e-12
+        )
+        ratios.append(cut_face_area(mesh) / swept)
     assert np.std(ratios) < 0.05 / depth
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_swept_area_that_stays_closed_is_said_and_nothing_else_is():
+    """A blade half an edge deep may cross no edge inside the tissue: there is no face to open."""
+    block, closed = organ_of('block', *good_block((8, 8, 6), 0.005, seed=101)), 0
+    for angle in ANGLES:
+        for depth in (0.5, 1.0):
+            cut, swept = straight(block, depth, angle)
+            mesh, warnings, _ = cut_mesh(block, cut)
+            share = cut_face_area(mesh) / swept
+            said = any('so shallow' in warning for warning in warnings)
+            assert said or share > 0.6
+            assert not said or share < 0.8
+            closed += said
+    assert closed > 0

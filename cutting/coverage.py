@@ -1,0 +1,55 @@
+"""Coverage: whether the mesh has opened the surface that a stroke has swept."""
+
+import numpy as np
+
+from cutting_trainer.cutting.front import Opened
+from cutting_trainer.cutting.parting import Floats
+from cutting_trainer.node_common.kernels import kernel
+from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, find_tetrahedra
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.topology import CUT
+
+_STEP = 0.25
+"""Way between two places that are looked at, in edges."""
+_NEAR = 0.6
+"""Distance from the opened faces up to which a place counts as opened, in edges."""
+
+
+def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple[float, Floats]:
+    """Return the swept area in the tissue that is not opened [m^2], and its middle [m], shape (3,).
+
+    Args:
+        mesh: the tissue.
+        lines: the blade's edge along the stroke, root and tip, in the rest shape [m], shape
+            (k, 2, 3).
+        opened: faces opened by cuts around the stroke.
+        h: length of an edge [m].
+    """
+    edges = lines[:, 1] - lines[:, 0]
+    longest = float(np.linalg.norm(edges, axis=1).max())
+    count = int(np.ceil(longest / (_STEP * h)))
+    shares = (np.arange(count) + 0.5)[:, None] / count
+    along, middles = np.diff(lines, axis=0), (lines[1:] + lines[:-1]) / 2
+    places = (middles[:, :1] + shares * np.diff(middles, axis=1)).reshape(-1, 3)
+    ways = along[:, :1] + shares * np.diff(along, axis=1)
+    sides = np.repeat(np.diff(middles, axis=1) / count, count, axis=1)
+    areas = np.linalg.norm(np.cross(ways, sides), axis=2).ravel()
+    found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, places)
+    places, areas = places[found >= 0], areas[found >= 0]
+    distance = _distances(places, opened.rest, opened.triangles)
+    earlier = mesh.triangles[mesh.triangle_kind == CUT]
+    closed = np.minimum(distance, _distances(places, mesh.rest, earlier)) > _NEAR * h
+    area = float(areas[closed].sum())
+    if area == 0.0:
+        return 0.0, np.zeros(3)
+    return area, areas[closed] @ places[closed] / area
+
+
+@kernel
+def _distances(places, rest, triangles):
+    """Return the distance of places from the nearest of some triangles [m], shape (p,)."""
+    out = np.full(len(places), np.inf)
+    if len(triangles):
+        for k in range(len(places)):
+            out[k] = distance_to_triangles(places[k], rest, triangles)
+    return out
