@@ -30,7 +30,7 @@ _CLEAR = 0.35
 """Height above the surface from which an element is on one side, in edges."""
 _MARGIN = 1.0
 """Width of the strip along a free border of the surface that is not judged, in edges."""
-_GAP = 1.0
+GAP = 1.0
 """Way between two remembered places of the blade from which it was outside between, in edges."""
 _SHEET = 0.4
 """Distance from the tangent plane up to which another place is of the same sheet, in edges."""
@@ -90,7 +90,7 @@ def _sides(local: Local, tables: Tables, first_new: int) -> tuple[Mask, Mask]:
 def _judged_surface(lines: Floats, h: float) -> Surface:
     """Return the surface that a stroke has swept, away from its borders and its other sheets."""
     steps = np.linalg.norm(np.diff(lines, axis=0), axis=2).mean(axis=1)
-    runs = np.split(lines, np.flatnonzero(steps > _GAP * h) + 1)
+    runs = np.split(lines, np.flatnonzero(steps > GAP * h) + 1)
     runs = [_filled(run, h) for run in runs if len(run) > 1]
     if not runs:
         return Surface(np.zeros((0, 3)), np.zeros((0, 3)))

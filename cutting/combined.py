@@ -120,7 +120,7 @@ class CombinedMethod:
         if folded:
             warnings.append(FOLDED)
         if finish or folded:
-            delta, more, said = self._join_strokes(mesh, delta)
+            delta, more, said = self._join_strokes(mesh, delta, folded=folded)
             area += more
             warnings += said
             self._empty_tables(mesh, delta.node_parents.shape[0])
@@ -155,7 +155,7 @@ class CombinedMethod:
             self._lines = np.concatenate([self._lines, edge[None]])
 
     def _join_strokes(
-        self, mesh: TetMesh, delta: TopologyDelta
+        self, mesh: TetMesh, delta: TopologyDelta, *, folded: bool
     ) -> tuple[TopologyDelta, float, list[str]]:
         """Part the tissue that this stroke has left, also where it meets the ends of earlier ones;
         remember its ends.
@@ -177,7 +177,7 @@ class CombinedMethod:
         delta, more, opened = slide_front(mesh, delta, nodes, self._first_new, lines, h, small)
         said = [_HOLDS.format(*1e3 * place) for place in places[:1]]
         closed, middle = closed_area(mesh, lines, opened, h)
-        if closed > _MAX_CLOSED * h**2:
+        if closed > _MAX_CLOSED * h**2 and not folded:
             said.append(_CLOSED.format(1e4 * closed, *1e3 * middle, 1e3 * h))
         return delta, area + more, said
 

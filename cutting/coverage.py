@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from cutting_trainer.cutting.bridges import GAP
 from cutting_trainer.cutting.front import Opened
 from cutting_trainer.cutting.parting import Floats
 from cutting_trainer.node_common.kernels import kernel
@@ -35,7 +36,9 @@ def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple
     sides = np.repeat(np.diff(middles, axis=1) / count, count, axis=1)
     areas = np.linalg.norm(np.cross(ways, sides), axis=2).ravel()
     found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, places)
-    places, areas = places[found >= 0], areas[found >= 0]
+    outside = np.linalg.norm(along, axis=2).mean(axis=1) > GAP * h
+    inside = (found >= 0) & ~np.repeat(outside, count)
+    places, areas = places[inside], areas[inside]
     distance = _distances(places, opened.rest, opened.triangles)
     earlier = mesh.triangles[mesh.triangle_kind == CUT]
     closed = np.minimum(distance, _distances(places, mesh.rest, earlier)) > _NEAR * h
