@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.bags.beginning import ComputationStart
-from cutting_trainer.bags.frames import FrameRecord, Restart, Segment, read_run, runs
-from cutting_trainer.bags.order import Sequence
+from cutting_trainer.bags.message_order import Sequence
 from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.recorded_frames import FrameRecord, Restart, Segment, read_run, runs
 from cutting_trainer.bags.resimulation import LACKS_MEMORY, Resimulation
-from cutting_trainer.bags.topics import INPUTS, MESH, UPDATES
+from cutting_trainer.bags.resimulation_start import ComputationStart
+from cutting_trainer.bags.topic_names import INPUTS, MESH, UPDATES
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
 from cutting_trainer.tissue_sim.contact.tool import Frame

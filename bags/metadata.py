@@ -8,8 +8,8 @@ from typing import Any
 import yaml
 
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.plain_yaml import MAX_BYTES, load_yaml
-from cutting_trainer.bags.qos import Profiles, metadata_profiles
+from cutting_trainer.bags.recorded_qos import Profiles, metadata_profiles
+from cutting_trainer.bags.untrusted_yaml import MAX_BYTES, load_yaml
 from cutting_trainer.node_common.code_identity import CodeIdentity, identity_of
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError, read_bounded
 

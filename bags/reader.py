@@ -17,8 +17,8 @@ from cutting_trainer.bags.mcap.records import MAGIC, McapFile
 from cutting_trainer.bags.mcap.salvage import Salvage
 from cutting_trainer.bags.mcap.summary import McapSummary, read_summary
 from cutting_trainer.bags.metadata import FORMAT_VERSION, METADATA_FILE, read_metadata
-from cutting_trainer.bags.plain_yaml import text_by_key
-from cutting_trainer.bags.qos import OfferedQos, profiles_from
+from cutting_trainer.bags.recorded_qos import OfferedQos, profiles_from
+from cutting_trainer.bags.untrusted_yaml import text_by_key
 
 
 @dataclass(frozen=True, slots=True)

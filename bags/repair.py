@@ -10,14 +10,14 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.integrity_check import flaw
 from cutting_trainer.bags.mcap.chunks import ChunkError
 from cutting_trainer.bags.mcap.salvage import Salvage, Salvaged
 from cutting_trainer.bags.mcap.summary import read_index
 from cutting_trainer.bags.metadata import METADATA_FILE, read_metadata
-from cutting_trainer.bags.plain_yaml import load_yaml, text_by_key
-from cutting_trainer.bags.qos import Profiles, profiles_from
 from cutting_trainer.bags.reader import mcap_file
-from cutting_trainer.bags.wholeness import flaw
+from cutting_trainer.bags.recorded_qos import Profiles, profiles_from
+from cutting_trainer.bags.untrusted_yaml import load_yaml, text_by_key
 from cutting_trainer.bags.writer import BagWriter
 
 _TEMPORARY = 'repair.tmp'

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.frames import FrameRecord
-from cutting_trainer.cutting.method import (
+from cutting_trainer.bags.recorded_frames import FrameRecord
+from cutting_trainer.cutting.method_interface import (
     FAILURES,
     CutMethod,
     CutResult,

@@ -9,7 +9,7 @@ from mcap.writer import Writer
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.metadata import Tally, Topic, bag_information, to_yaml, write_metadata
-from cutting_trainer.bags.qos import Profiles, channel_profiles
+from cutting_trainer.bags.recorded_qos import Profiles, channel_profiles
 
 
 class BagWriter:

@@ -17,7 +17,7 @@ from cutting_trainer.cli.options import (
     Seed,
 )
 from cutting_trainer.session.domain import parse_domain
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 Output = Annotated[
     Path, typer.Option('--output', '-o', help='Folder for page, tables and pictures.')
@@ -151,7 +151,7 @@ def stability(
     as_json: AsJson = False,
 ) -> None:
     """Print each integrator's largest stable step on a scene's mesh: by theory, and measured."""
-    from bench.accuracy.stability import run_stability
+    from bench.accuracy.integrator_limits import run_stability
 
     run_stability(scene, as_json=as_json)
 
@@ -211,7 +211,7 @@ def fuzz_cuts(
 ) -> None:
     """Cut random meshes by random strokes and check every invariant after every batch."""
     from bench.cuts.fuzz_cuts import replay_scene, run_strokes
-    from bench.cuts.yanks import run_yanks
+    from bench.cuts.random_loads import run_yanks
 
     if yanks:
         raise typer.Exit(int(run_yanks(yanks, seed, output / 'yanks.jsonl')))

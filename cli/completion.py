@@ -10,7 +10,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from cutting_trainer.session.scene import SCENES
+from cutting_trainer.session.scene_loader import SCENES
 
 Shell = Literal['bash', 'zsh']
 LAUNCHERS_OWN = ('setup', 'overlay', 'clean', 'bench', 'chart', 'validate')

@@ -79,7 +79,7 @@ def _measure(name: str) -> str:
 
 def _ends(outgoing: str, incoming: str) -> tuple[Any, Any, Any]:
     """Return a node with a publisher and a polled subscription, in the transport of the nodes."""
-    from cutting_trainer.session.graph import discovery
+    from cutting_trainer.session.node_commands import discovery
 
     os.environ.update(discovery(os.environ))
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cutting_trainer.session.domain import FIRST_PORT, MAX_DOMAIN, PORTS_PER_DOMAIN
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 Level = Literal['ok', 'warning', 'error']
 

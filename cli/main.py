@@ -9,12 +9,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from cutting_trainer.cli import bags as commands_bags
-from cutting_trainer.cli import live as commands_live
-from cutting_trainer.cli import network as commands_network
-from cutting_trainer.cli import own as commands_own
+from cutting_trainer.cli import bag_commands, session_commands, two_host_commands, user_commands
 from cutting_trainer.cli.options import EXIT_STATUSES
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 app = typer.Typer(
     name='trainer',
@@ -25,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode='markdown',
 )
-for group in (commands_live, commands_network, commands_bags, commands_own):
+for group in (session_commands, two_host_commands, bag_commands, user_commands):
     app.add_typer(group.commands)
 
 
@@ -105,10 +102,10 @@ def _refuse(sentence: str) -> NoReturn:
 
 def _is_users(error: ValueError) -> bool:
     from cutting_trainer.bags.errors import BagError
-    from cutting_trainer.haptic_bridge.settings import SettingsError
+    from cutting_trainer.haptic_bridge.scene_schema import SettingsError
     from cutting_trainer.node_common.errors import MeshError, SceneError
     from cutting_trainer.session.errors import SessionError
-    from cutting_trainer.viewer.gate import PageError
+    from cutting_trainer.viewer.access_control import PageError
 
     known = SessionError | SceneError | MeshError | SettingsError | BagError | PageError
     return isinstance(error, known)

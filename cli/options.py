@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 EXIT_STATUSES = 'Exit status: ' + '; '.join(f'{int(s)} {s.meaning}' for s in Status) + '.'
 

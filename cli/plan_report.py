@@ -7,14 +7,14 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost
 from cutting_trainer.tissue_sim.planner.method_errors import model_errors
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
-from cutting_trainer.tissue_sim.planner.reasons import inaccurate, ms, percent
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.tissue_sim.planner.rejection_reasons import inaccurate, ms, percent
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.warm_up import warm_up
 
 

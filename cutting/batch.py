@@ -17,7 +17,7 @@ from cutting_trainer.cutting.lookup import (
     find_edge,
     with_room,
 )
-from cutting_trainer.cutting.method import CASES, CutReport
+from cutting_trainer.cutting.method_interface import CASES, CutReport
 from cutting_trainer.cutting.node_splitting import (
     Patch,
     cut_area,

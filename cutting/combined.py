@@ -13,10 +13,10 @@ from cutting_trainer.cutting.front import slide_front
 from cutting_trainer.cutting.geometry import smallest_altitudes
 from cutting_trainer.cutting.junctions import part_junctions
 from cutting_trainer.cutting.lookup import NODES, clear, empty_tables, with_room
-from cutting_trainer.cutting.method import CutResult, check_sweep
+from cutting_trainer.cutting.method_interface import CutResult, check_sweep
+from cutting_trainer.cutting.snap_release import settle_waiting
 from cutting_trainer.cutting.snapping import SnapLimits, SnapStroke, conflicts, register
 from cutting_trainer.cutting.state_table import active_list, pending
-from cutting_trainer.cutting.waiting import settle_waiting
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, grown
 

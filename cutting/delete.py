@@ -3,7 +3,7 @@
 import numpy as np
 
 from cutting_trainer.cutting.broad_phase import touched_tetrahedra
-from cutting_trainer.cutting.method import CutReport, CutResult, removed_volume
+from cutting_trainer.cutting.method_interface import CutReport, CutResult, removed_volume
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 

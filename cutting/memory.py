@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from cutting_trainer.cutting import batch, combined, combined_state, delete, lookup
-from cutting_trainer.cutting.method import CutMethod
+from cutting_trainer.cutting import batch, combined, delete, lookup, stroke_state_check
+from cutting_trainer.cutting.method_interface import CutMethod
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.simulation.object_state import (
+from cutting_trainer.tissue_sim.simulation.serialisation import (
     ObjectState,
     capture,
     classes_of,
@@ -57,4 +57,4 @@ def from_state(state: ObjectState, method: CutMethod) -> MethodState:
 def _check(memory: MethodState) -> None:
     check_mesh(memory.mesh)
     if isinstance(memory.method, combined.CombinedMethod):
-        combined_state.check_combined(memory.method, memory.mesh)
+        stroke_state_check.check_combined(memory.method, memory.mesh)

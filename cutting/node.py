@@ -10,9 +10,9 @@ from cutting_trainer_msgs.srv import Cut, GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from cutting_trainer.cutting.memory import MethodState
-from cutting_trainer.cutting.method import FAILURES, CutResult, SweepError, carry_out
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_interface import FAILURES, CutResult, SweepError, carry_out
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.errors import MeshError
@@ -22,7 +22,7 @@ from cutting_trainer.node_common.parameters import (
     seed_parameter,
 )
 from cutting_trainer.node_common.rejections import MessageError, require_frame, require_tool
-from cutting_trainer.node_common.scene_file import read_section
+from cutting_trainer.node_common.scene_reader import read_section
 from cutting_trainer.node_common.stamps import REVISION_MODULUS
 from cutting_trainer.node_common.timing import FRAME_NICENESS, request_preference
 from cutting_trainer.tissue_sim.contact.blade import Sweep

@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 
 from cutting_trainer.cutting.lookup import empty_tables, with_room
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.parting import Surface, part_along
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.state_table import block, put_on_cut
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta

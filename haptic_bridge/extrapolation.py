@@ -7,6 +7,7 @@ extrapolated over too.
 
 import numpy as np
 
+from cutting_trainer.haptic_bridge.proxy.coupling_spring import surface_stiffness
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.node_common.kernels import inner, kernel
 
@@ -132,16 +133,6 @@ def local_stiffness(
         for j in range(3):
             pull += stiffness[k, j] * (position[j] - at[j])
         out[k] = force[k] - scale * pull
-
-
-@kernel(nogil=True)
-def surface_stiffness(stiffness: np.ndarray, largest: float) -> float:
-    """Return k of a frictionless contact K = k n n^T - n g^T, g along the surface [N/m].
-
-    `largest` if it is unknown. The normal may rotate along the path; k stays the same.
-    """
-    k = stiffness[0, 0] + stiffness[1, 1] + stiffness[2, 2]
-    return k if 0.0 < k < largest else largest
 
 
 @inner

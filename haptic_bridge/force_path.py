@@ -12,15 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge import chain, extrapolation, safety
-from cutting_trainer.haptic_bridge.chain import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge import extrapolation, force_kernels, safety
+from cutting_trainer.haptic_bridge.contact_plausibility import MAX_STEP_AHEAD, ContactPlausibility
 from cutting_trainer.haptic_bridge.contact_values import Tick, contact_values
 from cutting_trainer.haptic_bridge.devices.motion_gate import MotionGate
-from cutting_trainer.haptic_bridge.plausible import MAX_STEP_AHEAD, ContactPlausibility
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.proxy.coupling_spring import surface_stiffness
 from cutting_trainer.haptic_bridge.proxy.friction import make_proxy, split_stiffness
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.haptic_bridge.proxy.undented_surface import UndentedSurface
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
@@ -89,8 +90,8 @@ class ForcePath:
         self.rejections = rejections or RejectionStatistics()
         self.contact_time = 0.0
         self.max_force = 0.0
-        self._setup = chain.make_setup(tool, device, haptics, profile)
-        self._state = np.zeros(1, chain.STATE)
+        self._setup = force_kernels.make_setup(tool, device, haptics, profile)
+        self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
         names = ('force', 'wrench', 'tip', 'external', 'blade')
         self._force, self._wrench, self._tip, self._external, self._blade = map(
@@ -125,7 +126,9 @@ class ForcePath:
             ValidationError: the scale is out of range.
         """
         self.haptics = self.check_scale(force_scale)
-        self._setup = chain.make_setup(self._tool, self._device, self.haptics, self._profile)
+        self._setup = force_kernels.make_setup(
+            self._tool, self._device, self.haptics, self._profile
+        )
 
     def check_scale(self, force_scale: float) -> HapticsSettings:
         """Return the settings with another scale, or raise as `scale_force`; nothing changes."""
@@ -198,7 +201,9 @@ class ForcePath:
             sample_ns: arrival time of the sample [ns] if it waited in a queue; None: `now_ns`.
             surface: the newest surface of the tissue; None before the first.
         """
-        elapsed = min(max((now_ns - self._last_ns) * _SECOND, 1e-4), chain.MAX_SLEW_PERIOD_S)
+        elapsed = min(
+            max((now_ns - self._last_ns) * _SECOND, 1e-4), force_kernels.MAX_SLEW_PERIOD_S
+        )
         self._last_ns = now_ns
         enabled = state is CrtkState.ENABLED
         fault = self._take_pose(now_ns, pose, enabled) or self._take_sample(
@@ -213,7 +218,7 @@ class ForcePath:
         touched = self._touch(now_ns, surface, enabled)
         if fault or state is CrtkState.FAULT:
             self._s['force'] = 0.0
-        if not chain.command(
+        if not force_kernels.command(
             self._setup,
             self._state,
             self._history,
@@ -254,7 +259,7 @@ class ForcePath:
         if code != safety.OK:
             self.rejections.add(POSE, MessageError(safety.POSE_FAULTS[code]))
             return safety.POSE_FAULTS[code]
-        chain.to_tissue(self._setup, self._state, self._pose)
+        force_kernels.to_tissue(self._setup, self._state, self._pose)
         if not known:
             self._s['moved'] = 0.0
         self._pose_stamp, self._pose_ns = pose.stamp_ns, now_ns
@@ -294,7 +299,7 @@ class ForcePath:
             slack = float(self._setup['slack'][0])
             self._s['held'] = min(self._s['held'], math.hypot(*reaction.force) + slack)
         elif reaction.stiffness.any():
-            reported = extrapolation.surface_stiffness(reaction.stiffness, self._tail[0])
+            reported = surface_stiffness(reaction.stiffness, self._tail[0])
             self._plausibility.update_stiffness(self._state, now_ns, reported)
         answered = self._began <= reaction.sequence <= self._sequence and self._contact == TOUCHING
         if reaction.state == INSIDE or answered:

@@ -16,10 +16,10 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.parameter import Parameter
 
 from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
-from cutting_trainer.haptic_bridge.devices.wiring import Wiring
-from cutting_trainer.haptic_bridge.e_stop import EStop, Listener
+from cutting_trainer.haptic_bridge.devices.probe_graph import Wiring
+from cutting_trainer.haptic_bridge.e_stop_topic import EStop, Listener
 from cutting_trainer.haptic_bridge.force_path import ForcePath
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.haptic_bridge.simulation_follower import SimulationFollower
 from cutting_trainer.haptic_bridge.warm_up import warm_up
 from cutting_trainer.node_common import qos, ros
@@ -42,11 +42,11 @@ from cutting_trainer.node_common.operating_state import (
 from cutting_trainer.node_common.parameters import parameter, scene_parameter, seed_parameter
 from cutting_trainer.node_common.publishers import PublisherMonitor
 from cutting_trainer.node_common.realtime import prepare, run_real_time
-from cutting_trainer.node_common.scene_file import read_section
+from cutting_trainer.node_common.scene_reader import read_section
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MESH_POLL_PERIOD_S = 0.003
 """[s] between two polls for meshes of the simulation."""

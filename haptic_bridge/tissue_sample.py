@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.chain import INSIDE
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
 from cutting_trainer.node_common.rejections import TOOLS, MessageError
 from cutting_trainer.tissue_sim.mesh.replica import MAX_COORDINATE

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge import plausible
-from cutting_trainer.haptic_bridge.chain import TOUCHING
+from cutting_trainer.haptic_bridge import contact_plausibility
+from cutting_trainer.haptic_bridge.force_kernels import TOUCHING
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
@@ -45,7 +45,7 @@ def warm_up(
         path.tick(stamp, state=state, pose=pose, sample=sample, surface=surface)
         surface = Surface(corners, triangle, revision=i + 1, topology=0, previous=surface)
         corners = corners + 1e-5
-    work = np.zeros(1, plausible.WORK)
-    plausible.is_near(surface.geometry, 1.0, corners[:2], tool.radius, work)
-    plausible.is_under(surface.geometry, 1.0, corners[:2], work)
+    work = np.zeros(1, contact_plausibility.WORK)
+    contact_plausibility.is_near(surface.geometry, 1.0, corners[:2], tool.radius, work)
+    contact_plausibility.is_under(surface.geometry, 1.0, corners[:2], work)
     return path

@@ -19,8 +19,8 @@ from cutting_trainer.mesh_import.mesher import fill
 from cutting_trainer.mesh_import.surface_import import Surface, read_surface
 from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation, make_task
 from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.mesh.checks import quality

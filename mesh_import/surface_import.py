@@ -9,10 +9,10 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh import repair
 
-from cutting_trainer.node_common.scene_file import missing_file
+from cutting_trainer.node_common.scene_reader import missing_file
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.mesh.checks import MAX_SIZE, MIN_SIZE
-from cutting_trainer.tissue_sim.settings import UNIT_SCALE
+from cutting_trainer.tissue_sim.scene_schema import UNIT_SCALE
 
 MAX_TRIANGLES = 500_000
 MAX_HOLE_EDGES = 4

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 from llvmlite import binding
 
-from cutting_trainer.node_common.share import PACKAGES, ROOMS, share_folder
+from cutting_trainer.node_common.share_folder import PACKAGES, ROOMS, share_folder
 
 KERNELS = ('tissue_sim', 'cutting', 'haptic_bridge')
 """Packages whose kernels decide the numbers of a session."""

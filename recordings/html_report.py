@@ -15,15 +15,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cutting_trainer.bags.metadata import recorded_code
-from cutting_trainer.bags.player import first_time
+from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import Bag, open_bag
+from cutting_trainer.bags.recorded_tissue import first_tissue, tissue_at
 from cutting_trainer.bags.repair import repair_note
-from cutting_trainer.bags.tissue import first_tissue, tissue_at
-from cutting_trainer.bags.topics import CUTS, POSE, of_session
-from cutting_trainer.haptic_bridge.chain import INSIDE, NONE
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ScriptSettings
+from cutting_trainer.bags.topic_names import CUTS, POSE, of_session
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ScriptSettings
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec
-from cutting_trainer.recordings.incision import (
+from cutting_trainer.recordings.incision_metrics import (
     distance_to_paths,
     extent,
     planned_paths,
@@ -31,9 +31,9 @@ from cutting_trainer.recordings.incision import (
 )
 from cutting_trainer.recordings.picture import STYLE, Story, draw_tissue, read_story, spans
 from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.evidence import read_evidence
-from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.session.summary import NodeSummary, Summary, summarise
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
 from cutting_trainer.tissue_sim.mesh.pieces import pieces_of

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from cutting_trainer.bags.player import first_time
+from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.tissue import first_current_keyframe, follow
-from cutting_trainer.bags.topics import CONTACT, MESH, SERVO_CF, UPDATES, of_session
-from cutting_trainer.haptic_bridge.chain import INSIDE, NONE
+from cutting_trainer.bags.recorded_tissue import first_current_keyframe, follow
+from cutting_trainer.bags.topic_names import CONTACT, MESH, SERVO_CF, UPDATES, of_session
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE
 from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica

@@ -12,14 +12,14 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.frames import first_keyframe
 from cutting_trainer.bags.metadata import recorded_parameters
-from cutting_trainer.bags.plain_yaml import text_by_key
 from cutting_trainer.bags.reader import Bag
-from cutting_trainer.node_common.scene_file import check_yaml
+from cutting_trainer.bags.recorded_frames import first_keyframe
+from cutting_trainer.bags.untrusted_yaml import text_by_key
+from cutting_trainer.node_common.scene_reader import check_yaml
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError
-from cutting_trainer.session.changed_scene import change
-from cutting_trainer.session.graph import TISSUE_NODE
+from cutting_trainer.session.node_commands import TISSUE_NODE
+from cutting_trainer.session.scene_overrides import change
 
 MESH_FILE = 'tissue.vtk'
 _SCENE_FILE = re.compile(r'[\w.-]{1,100}\.ya?ml')

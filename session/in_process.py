@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.cutting.method import CutMethod, outcome_of
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_interface import CutMethod, outcome_of
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.contact_values import Tick
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.node_common.cdr_codec import ContactCodec, StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
-from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutOutcome, Frame, ToolContact
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta

@@ -13,7 +13,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from cutting_trainer.session.graph import (
+from cutting_trainer.session.node_commands import (
     ARM_NODE,
     BRIDGE_NODE,
     RECORDER_NODE,

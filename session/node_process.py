@@ -21,7 +21,7 @@ MAX_READS = 16
 HEARTBEAT_PERIOD_S = 0.5
 LOG_CLOSE_TIMEOUT_S = 2.0
 """Time [s] that the end of a node waits for the disk to write the last lines of its log."""
-_BOUND = (sys.executable, '-I', '-S', str(Path(__file__).with_name('child.py')))
+_BOUND = (sys.executable, '-I', '-S', str(Path(__file__).with_name('parent_death_signal.py')))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.session.evidence import Evidence, Status
+from cutting_trainer.session.bag_measurements import Evidence, Status
 
 SETTLING_TIME_S = 1.0
 """Rates count from so long [s] after the first report of the last node."""

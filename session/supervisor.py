@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from cutting_trainer.session.e_stop import PRESS, PRESSED, EStopState
+from cutting_trainer.session.e_stop_latch import PRESS, PRESSED, EStopState
 from cutting_trainer.session.node_process import (
     NodeCommand,
     NodeProcess,
@@ -18,7 +18,7 @@ from cutting_trainer.session.node_process import (
     unready_sentence,
 )
 from cutting_trainer.session.outcome import Death, Outcome, describe
-from cutting_trainer.session.restarts import Backoff
+from cutting_trainer.session.restart_backoff import Backoff
 
 STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 POLL_PERIOD_S = 0.05  # [s]

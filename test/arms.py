@@ -4,8 +4,8 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
-from cutting_trainer.haptic_bridge.settings import Transform
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
+from cutting_trainer.haptic_bridge.scene_schema import Transform
 
 MS = 1_000_000
 LIMP = {'stiffness': 0.0, 'damping': 0.0}

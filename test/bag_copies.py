@@ -5,7 +5,7 @@ from pathlib import Path
 
 from cutting_trainer.bags.metadata import read_metadata
 from cutting_trainer.bags.reader import Recorded, open_bag
-from cutting_trainer.bags.topics import POSE
+from cutting_trainer.bags.topic_names import POSE
 from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec
 

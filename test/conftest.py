@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from cutting_trainer.session.graph import discovery
+from cutting_trainer.session.node_commands import discovery
 
 # How long an example takes is a matter of the machine, and of what it must compile first.
 settings.register_profile('all', deadline=None)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from rig import PROFILE, QUIET, RADIUS, K, Rig, lowered
 
-from cutting_trainer.haptic_bridge.chain import INSIDE, MAX_SLEW_PERIOD_S, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, MAX_SLEW_PERIOD_S, NONE, TOUCHING
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.rejections import RejectionStatistics
 

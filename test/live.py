@@ -24,14 +24,14 @@ from rclpy.node import Node
 from ruamel.yaml import YAML
 
 from cutting_trainer.bags.reader import Recorded, open_bag
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, WrenchStampedCodec
 from cutting_trainer.node_common.qos import NEWEST_BEST_EFFORT
 from cutting_trainer.node_common.ros import polled, take_raw
 from cutting_trainer.session.domain import MAX_DOMAIN, has_participants, reserved_domain
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.graph import MODULES, VIEWER_NODE
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import MODULES, VIEWER_NODE
 
 ROOT = Path(__file__).parents[1]
 NODES = tuple(name for name in MODULES if name != VIEWER_NODE)

@@ -10,21 +10,30 @@ from cutting_trainer.bags.message_text import schema_text
 from cutting_trainer.bags.metadata import FORMAT_VERSION, read_metadata
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.resimulation import Resimulation
-from cutting_trainer.bags.topics import CONTACT, FORCE, INPUTS, MEMORY, MESH, POSE, STATE, UPDATES
+from cutting_trainer.bags.topic_names import (
+    CONTACT,
+    FORCE,
+    INPUTS,
+    MEMORY,
+    MESH,
+    POSE,
+    STATE,
+    UPDATES,
+)
 from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.cutting.memory import MethodState
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec, PoseStampedCodec
 from cutting_trainer.node_common.code_identity import identity_here
 from cutting_trainer.node_common.ros import stamp
-from cutting_trainer.recordings.experiment import Hand, closed_loop
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import recomputation
-from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.recordings.resimulate_command import recomputation
+from cutting_trainer.recordings.what_if import Hand, closed_loop
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.simulation.cut_transaction import ANSWER_FRAMES
-from cutting_trainer.tissue_sim.simulation.object_state import ObjectState
+from cutting_trainer.tissue_sim.simulation.serialisation import ObjectState
 from cutting_trainer.tissue_sim.simulation.state import state_of
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, mesh_message
 from cutting_trainer.tissue_sim.streaming.state_publisher import state_messages

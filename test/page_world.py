@@ -13,22 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.viewer import plots
+from cutting_trainer.viewer.access_control import Gate, link
+from cutting_trainer.viewer.allowed_requests import LiveControls, ReplayControls
 from cutting_trainer.viewer.appearance import (
     FLOOR,
-    OTHER_TISSUE,
     camera,
     reach,
     shown_tissue,
     tool_shape,
 )
-from cutting_trainer.viewer.controls import LiveControls, ReplayControls
-from cutting_trainer.viewer.gate import Gate, link
+from cutting_trainer.viewer.colours import OTHER_TISSUE
+from cutting_trainer.viewer.drawn_surface import CUT, TissueSource
+from cutting_trainer.viewer.page_protocol import AnyMessage, Guide, Record, Scale
 from cutting_trainer.viewer.page_server import PageServer
-from cutting_trainer.viewer.protocol import AnyMessage, Guide, Record, Scale
-from cutting_trainer.viewer.surfaces import CUT, TissueSource
 
 TOKEN = 'stand-in'
 PERIOD = 1 / 30

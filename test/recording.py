@@ -50,7 +50,7 @@ class RecorderProcess:
         self.folder = folder
         settings = [f'{key}:={value}' for key, value in ({'bag': folder} | parameters).items()]
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'cutting_trainer.bags.node', '--ros-args']
+            [sys.executable, '-m', 'cutting_trainer.bags.recorder_node', '--ros-args']
             + [word for setting in settings for word in ('-p', setting)],
             cwd=ROOT,
             env=os.environ | {'ROS_DOMAIN_ID': str(DOMAIN), 'PYTHONUNBUFFERED': '1'},

@@ -3,9 +3,9 @@
 import numpy as np
 from flat_tissue import flat_surface
 
-from cutting_trainer.haptic_bridge.chain import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
 from cutting_trainer.haptic_bridge.force_path import ForcePath
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,

@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from cutting_trainer.cutting.checks import check_mesh, cut_faces
-from cutting_trainer.cutting.method import CutResult
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.cut_invariants import check_mesh, cut_faces
+from cutting_trainer.cutting.method_interface import CutResult
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 

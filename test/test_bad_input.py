@@ -16,11 +16,11 @@ from meshes import box
 from ruamel.yaml import YAML
 
 from bench.commands import app as bench
-from cutting_trainer.bags import node as recorder_node
+from cutting_trainer.bags import recorder_node as recorder_node
 from cutting_trainer.cli import main as cli
-from cutting_trainer.haptic_bridge import settings
-from cutting_trainer.session.scene import find_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.haptic_bridge import scene_schema
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.scene_loader import find_scene
 
 pytestmark = pytest.mark.long
 
@@ -378,7 +378,7 @@ def test_one_sentence_names_file_place_value_and_remedy(
     bad: Bad, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if (arguments := bad.prepare(tmp_path)) and (tmp_path / 'config').exists():
-        monkeypatch.setattr(settings, 'share_folder', lambda: tmp_path)
+        monkeypatch.setattr(scene_schema, 'share_folder', lambda: tmp_path)
     capfd.readouterr()
     with pytest.raises(SystemExit) as stopped:
         run(arguments)

@@ -11,20 +11,20 @@ from bag_copies import rewritten
 from diagnostic_msgs.msg import DiagnosticStatus
 from made_session import make_session
 
-from cutting_trainer.bags.beginning import find_beginning
 from cutting_trainer.bags.comparison import Comparison, compare
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.frames import read_frames
 from cutting_trainer.bags.metadata import METADATA_FILE
-from cutting_trainer.bags.node import Recorder
 from cutting_trainer.bags.reader import Recorded, mcap_file, open_bag
+from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.recorder_node import Recorder
+from cutting_trainer.bags.resimulation_start import find_beginning
 from cutting_trainer.bags.steady_clock import SteadyClock
-from cutting_trainer.bags.topics import CONTACT, INPUTS
+from cutting_trainer.bags.topic_names import CONTACT, INPUTS
 from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.cli import main as cli
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import pose_check, recomputation
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.recordings.resimulate_command import pose_check, recomputation
+from cutting_trainer.session.scene_loader import load_scene
 
 pytestmark = pytest.mark.long
 

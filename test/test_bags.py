@@ -18,12 +18,17 @@ from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.message_loss import SequenceCounter
 from cutting_trainer.bags.message_text import schema_text
 from cutting_trainer.bags.metadata import FORMAT_VERSION, read_metadata
-from cutting_trainer.bags.qos import INFINITE, OfferedQos, channel_profiles, metadata_profiles
 from cutting_trainer.bags.reader import Recorded, open_bag
+from cutting_trainer.bags.recorded_qos import (
+    INFINITE,
+    OfferedQos,
+    channel_profiles,
+    metadata_profiles,
+)
 from cutting_trainer.bags.repair import repair_bag
-from cutting_trainer.bags.sequences import SequenceCounter
 from cutting_trainer.bags.writer import BagWriter
 
 SAMPLES = Path(__file__).resolve().parents[1] / 'bags' / 'samples' / 'format_2'

@@ -29,12 +29,12 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from cutting_trainer.bags.node import Recorder
 from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.recorder_node import Recorder
 from cutting_trainer.bags.repair import repair_bag
 from cutting_trainer.node_common.qos import LATCHED, STREAM, UPDATES
 from cutting_trainer.node_common.ros import CONTACT, FRAME_INPUTS, MESH_UPDATES, TISSUE_STATE
-from cutting_trainer.session.scene import find_scene
+from cutting_trainer.session.scene_loader import find_scene
 
 pytestmark = pytest.mark.real_time
 
@@ -314,7 +314,13 @@ def test_a_recorder_that_cannot_work_says_why_and_ends(
 ) -> None:
     words = [('-p', f'{key}:={value or repr(value)}') for key, value in parameters.items()]
     ended = subprocess.run(
-        [sys.executable, '-m', 'cutting_trainer.bags.node', '--ros-args', *itertools.chain(*words)],
+        [
+            sys.executable,
+            '-m',
+            'cutting_trainer.bags.recorder_node',
+            '--ros-args',
+            *itertools.chain(*words),
+        ],
         cwd=tmp_path,
         env=os.environ | {'PYTHONPATH': f'{ROOT}{os.pathsep}{os.environ.get("PYTHONPATH", "")}'},
         capture_output=True,

@@ -14,7 +14,7 @@ from cutting_trainer.bags.metadata import read_metadata
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.repair import repair_bag, repair_note
 from cutting_trainer.bags.writer import BagWriter
-from cutting_trainer.recordings.repair import account_lines, repair
+from cutting_trainer.recordings.repair_command import account_lines, repair
 
 pytestmark = pytest.mark.long
 

@@ -16,7 +16,7 @@ from cutting_trainer.node_common.timing import (
     FairLock,
     PeriodicLoop,
 )
-from cutting_trainer.session.evidence import Status
+from cutting_trainer.session.bag_measurements import Status
 
 pytestmark = pytest.mark.long
 

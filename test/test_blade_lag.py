@@ -5,8 +5,8 @@ import pytest
 from meshes import irregular_box
 from test_blade import TOUGHNESS, contact_at
 
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.in_process import Tissue
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.elasticity.material import Material

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from bridge_world import DEPTH, PRESSED, SCHEDULING, K, Record, World, refused, session
 
-from cutting_trainer.haptic_bridge.chain import NONE
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.haptic_bridge.force_kernels import NONE
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec
 

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from sensor_msgs.msg import Joy
 
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec, StampedCodec
 

@@ -17,7 +17,7 @@ from bridge_world import (
     session,
 )
 
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 
 pytestmark = pytest.mark.real_time

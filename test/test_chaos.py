@@ -17,8 +17,13 @@ from bench.trials.chaos_verdict import (
     lost_cuts,
     not_recovered,
 )
-from cutting_trainer.session.restarts import HEALTHY_AFTER_S, INITIAL_DELAY_S, MAX_DELAY_S, Backoff
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.restart_backoff import (
+    HEALTHY_AFTER_S,
+    INITIAL_DELAY_S,
+    MAX_DELAY_S,
+    Backoff,
+)
 
 LEVEL = 1.0
 """[N] that is commanded all the time."""

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from bench.accuracy import chart
-from bench.accuracy import stability as stability_report
+from bench.accuracy import integrator_limits as stability_report
 from bench.accuracy.chart import THESIS, cost_for, sentence, write_chart
 from bench.accuracy.front import read_points, reasons_off_front, scenes, standing
+from bench.accuracy.integrator_limits import highest_mode, measured_limit
 from bench.accuracy.measure import Point, cpu_per_second, with_front
 from bench.accuracy.problems import AfterCut, Cantilever, static_problems
 from bench.accuracy.reference import HexGrid, Solid, exact_beam, extrapolated, graded
 from bench.accuracy.region import LocalPalpation, describe
 from bench.accuracy.reproduction import block_100, block_258, efficiency, orders
-from bench.accuracy.stability import highest_mode, measured_limit
 from bench.accuracy.vibration import Vibration
 from bench.common.meshes import end_load, kuhn_block
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping

@@ -12,9 +12,9 @@ import pytest
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.cli import main as cli
-from cutting_trainer.cli import own as commands_own
+from cutting_trainer.cli import user_commands
 from cutting_trainer.cli.bag_errors import reading
-from cutting_trainer.cli.checks import (
+from cutting_trainer.cli.test_command import (
     ALONE,
     NO_TESTS,
     TESTS,
@@ -24,8 +24,8 @@ from cutting_trainer.cli.checks import (
     verdict,
 )
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.scene import SCENES, find_scene, load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.scene_loader import SCENES, find_scene, load_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -180,7 +180,7 @@ def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch: pytest.Mo
     def stumble(options: object) -> Status:
         raise ValueError('a bug')
 
-    monkeypatch.setattr('cutting_trainer.session.demo.run_demo', stumble)
+    monkeypatch.setattr('cutting_trainer.session.demo_command.run_demo', stumble)
     with pytest.raises(ValueError, match='a bug'):
         cli.main(['demo'])
 
@@ -191,7 +191,7 @@ def test_interrupt_outside_a_session_has_the_status_of_an_interrupt(
     def interrupted(options: object) -> Status:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr('cutting_trainer.session.demo.run_demo', interrupted)
+    monkeypatch.setattr('cutting_trainer.session.demo_command.run_demo', interrupted)
     assert trainer('demo') == Status.INTERRUPTED
 
 
@@ -232,7 +232,7 @@ def test_test_command_runs_every_check_and_has_the_status_of_the_first_that_fail
 def test_test_command_of_an_installation_says_that_the_tests_are_in_the_source(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(commands_own, '__file__', str(tmp_path / 'session' / 'cli.py'))
+    monkeypatch.setattr(user_commands, '__file__', str(tmp_path / 'session' / 'cli.py'))
     assert trainer('test') == Status.BAD_INPUT
     assert 'in a checkout of its source' in one_error_line(capsys)
 
@@ -263,7 +263,7 @@ def test_arguments_may_choose_tests_of_one_part_but_not_of_none() -> None:
 def test_nodes_get_their_parameters_quoted_and_one_environment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from cutting_trainer.session.graph import node_environment, session_nodes
+    from cutting_trainer.session.node_commands import node_environment, session_nodes
 
     nodes = session_nodes(Path('/a b/c: d.yaml'), Path('/bags/x'), 3, 12)
     assert [node.name for node in nodes][-1] == 'recorder' and nodes[-1].records

@@ -13,7 +13,7 @@ from live import node_words, running
 
 pytest.importorskip('rclpy')
 
-from cutting_trainer.session.graph import MODULES, node_environment
+from cutting_trainer.session.node_commands import MODULES, node_environment
 
 pytestmark = pytest.mark.real_time
 

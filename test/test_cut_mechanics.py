@@ -8,9 +8,9 @@ import pytest
 from meshes import box, irregular_box
 
 from bench.cuts.random_strokes import random_stroke, shuffled_box
-from cutting_trainer.cutting.method import CASES
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_interface import CASES
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material

@@ -15,17 +15,17 @@ from cutting_trainer_msgs.msg import ForceSample, FrameInputs
 from cutting_trainer_msgs.srv import Cut
 from live import free_domain
 
-from cutting_trainer.bags.frames import FrameRecord, read_frames
 from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.recorded_frames import FrameRecord, read_frames
 from cutting_trainer.bags.resimulation import Resimulation
 from cutting_trainer.cutting.combined import CombinedMethod
-from cutting_trainer.cutting.method import FAILURES, SweepError, carry_out
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_interface import FAILURES, SweepError, carry_out
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.node_common.lifecycle import Stop
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import recomputation
+from cutting_trainer.recordings.resimulate_command import recomputation
 from cutting_trainer.session.in_process import Tissue
-from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim import node as node_module
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact

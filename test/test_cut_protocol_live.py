@@ -17,13 +17,13 @@ from cutting_trainer_msgs.srv import Cut, GetMesh
 from live import free_domain, node_words, running, wait_for
 from rclpy.executors import SingleThreadedExecutor
 
-from cutting_trainer.bags.frames import read_frames
 from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.recorded_frames import read_frames
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import recomputation
-from cutting_trainer.session.graph import node_environment
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.recordings.resimulate_command import recomputation
+from cutting_trainer.session.node_commands import node_environment
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
 from cutting_trainer.tissue_sim.contact.tool import CutOutcome
 

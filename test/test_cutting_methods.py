@@ -5,9 +5,9 @@ import pytest
 from meshes import box, irregular_box
 from strokes import draw, mesh_of, method_named, straight, total_area
 
-from cutting_trainer.cutting.checks import pieces
+from cutting_trainer.cutting.cut_invariants import pieces
 from cutting_trainer.cutting.geometry import smallest_altitudes
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import interpolated

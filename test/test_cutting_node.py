@@ -20,9 +20,9 @@ from live import free_domain, wait_for
 from meshes import box
 from rclpy.executors import SingleThreadedExecutor
 
-from cutting_trainer.cutting.checks import check_mesh, pieces
+from cutting_trainer.cutting.cut_invariants import check_mesh, pieces
 from cutting_trainer.node_common import qos, ros
-from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.node_commands import node_environment
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, delta_from, mesh_message
 

@@ -9,11 +9,16 @@ import pytest
 from bench.files.commands import READING, run
 from bench.files.damaged_bags import KINDS, damage, outcome, small_bag
 from bench.files.hostile_bags import HOSTILE_BAGS
+from cutting_trainer.bags.integrity_check import flaw
 from cutting_trainer.bags.reader import mcap_file, open_bag
 from cutting_trainer.bags.repair import repair_bag
-from cutting_trainer.bags.wholeness import flaw
-from cutting_trainer.cli import bags as commands_bags
-from cutting_trainer.recordings import html_report, picture, repair, resimulate
+from cutting_trainer.cli import bag_commands
+from cutting_trainer.recordings import (
+    html_report,
+    picture,
+    repair_command,
+    resimulate_command,
+)
 
 pytestmark = pytest.mark.long
 
@@ -22,7 +27,7 @@ TOPICS = ('/tissue/mesh', '/tissue/mesh_updates', '/tissue/force', '/tool/contac
 COPIES = 64
 MAX_MEMORY = 500
 """[MB]"""
-LOADED = (commands_bags, html_report, picture, repair, resimulate)
+LOADED = (bag_commands, html_report, picture, repair_command, resimulate_command)
 """Modules that commands would load: they are no part of what a bag takes."""
 HARMLESS = ('a scene', 'a format', 'an attachment', 'metadata without')
 """Kinds of which a command may need nothing."""

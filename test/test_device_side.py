@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
 from cutting_trainer.haptic_bridge.force_path import ForcePath
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
@@ -24,7 +24,7 @@ from cutting_trainer.haptic_bridge.settings import (
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState, OperatingStateMachine
 from cutting_trainer.node_common.rejections import RejectionStatistics
-from cutting_trainer.node_common.share import share_folder
+from cutting_trainer.node_common.share_folder import share_folder
 from cutting_trainer.node_common.stream_monitor import MAX_QUEUE_DELAY_S, StreamMonitor
 
 PROFILES = sorted((share_folder() / 'config' / 'devices').glob('*.yaml'))

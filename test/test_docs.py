@@ -14,10 +14,10 @@ from bench.commands import app as bench
 from bench.reference import scenes as scene_reference
 from cutting_trainer.cli.completion import LAUNCHERS_OWN
 from cutting_trainer.cli.main import app
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common import ros
 from cutting_trainer.node_common.operating_state import crtk_types
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 pytestmark = pytest.mark.long
 
@@ -101,7 +101,7 @@ BESIDE = (
     'crtk.py',
     'probe_node.py',
     'omni_node.py',
-    'player_node.py',
+    'playback_publishers.py',
     'dds_loopback.py',
     'mesh_follower.py',
     'operator.py',
@@ -153,7 +153,7 @@ def test_scene_reference_is_that_of_the_models() -> None:
 
 
 def test_every_section_of_a_scene_has_its_model() -> None:
-    from cutting_trainer.node_common.scene_file import SECTIONS
+    from cutting_trainer.node_common.scene_reader import SECTIONS
 
     assert tuple(scene_reference.MODELS) == SECTIONS
 

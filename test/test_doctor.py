@@ -13,8 +13,8 @@ import pytest
 from cutting_trainer.cli import doctor
 from cutting_trainer.cli.doctor import Finding
 from cutting_trainer.node_common import realtime
-from cutting_trainer.node_common.share import PACKAGES
-from cutting_trainer.session.status import Status
+from cutting_trainer.node_common.share_folder import PACKAGES
+from cutting_trainer.session.exit_status import Status
 
 pytestmark = pytest.mark.long
 

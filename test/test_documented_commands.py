@@ -22,7 +22,7 @@ from typer.main import get_command
 from bench.commands import app as bench
 from cutting_trainer.cli import main as cli
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.node_commands import node_environment
 
 pytestmark = pytest.mark.long
 
@@ -112,7 +112,7 @@ SHOWN = {
 """Run here, with a port that is free, until they say this; then ended by Ctrl-C."""
 DRIVES = Elsewhere(
     'test_integrate.py::test_example_that_drives_the_tool_presses_and_follows_the_mesh',
-    ('../session/graph.py',),
+    ('../session/node_commands.py',),
 )
 SMALL = 'scene:=bags/samples/palpation.yaml'
 NODES = (('tissue_sim', ''), ('cutting', ''), ('haptic_bridge', ' -p auto_enable:=true'))

@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from bench.flood import OFFERED_WORDS_PER_S, Flood
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import BRIDGE_NODE, node_command, node_environment
+from cutting_trainer.session.node_commands import BRIDGE_NODE, node_command, node_environment
 from cutting_trainer.session.supervisor import Event, Supervisor
 
 pytestmark = pytest.mark.real_time
@@ -172,7 +172,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     ours, theirs = pty.openpty()
     stdin, sys.stdin = sys.stdin, os.fdopen(theirs)
     with pytest.MonkeyPatch.context() as patch, reserved_domain('free') as domain:
-        patch.setattr('cutting_trainer.session.keys._of_another', lambda terminal: False)
+        patch.setattr('cutting_trainer.session.terminal_keys._of_another', lambda terminal: False)
         command = node_command(BRIDGE_NODE, {'scene': str(scene), 'auto_enable': True})
         command = command.__class__(
             command.name, command.argv, e_stop_arguments=command.e_stop_arguments

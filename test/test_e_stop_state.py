@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from cutting_trainer.haptic_bridge import e_stop
+from cutting_trainer.haptic_bridge import e_stop_topic
 from cutting_trainer.node_common.operating_state import OperatingStateMachine
-from cutting_trainer.session.e_stop import PRESSED, RELEASED, REPEAT_PERIOD_S, EStopState
-from cutting_trainer.session.keys import Keys
+from cutting_trainer.session.e_stop_latch import PRESSED, RELEASED, REPEAT_PERIOD_S, EStopState
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.supervisor import Supervisor
+from cutting_trainer.session.terminal_keys import Keys
 
 BRIDGE = NodeCommand('bridge', ('bridge',), e_stop_arguments=('-p', 'e_stop_pressed:=true'))
 OTHER = NodeCommand('other', ('other',))
@@ -25,7 +25,7 @@ def test_a_press_is_told_again_and_again_until_a_node_says_that_it_holds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = 100.0
-    monkeypatch.setattr('cutting_trainer.session.e_stop.time.monotonic', lambda: now)
+    monkeypatch.setattr('cutting_trainer.session.e_stop_latch.time.monotonic', lambda: now)
     state = EStopState([BRIDGE, OTHER], keys=False)
     assert not state.poll()
     state.ask()
@@ -66,7 +66,7 @@ def test_keys_of_a_terminal_that_is_closed_end_nothing(monkeypatch: pytest.Monke
     ours, theirs = os.openpty()
     with os.fdopen(theirs, 'r') as terminal:
         monkeypatch.setattr(sys, 'stdin', terminal)
-        monkeypatch.setattr('cutting_trainer.session.keys._of_another', lambda _: False)
+        monkeypatch.setattr('cutting_trainer.session.terminal_keys._of_another', lambda _: False)
         with Keys() as keys:
             os.write(ours, b'E')
             assert keys.pressed() == 'E'
@@ -84,16 +84,16 @@ def test_bridge_answers_each_request_of_the_launcher_though_it_is_pressed_alread
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     said: list[str] = []
-    monkeypatch.setattr(e_stop.output, 'announce', said.append)
-    monkeypatch.setattr(e_stop.ros, 'polled', lambda *_: None)
-    monkeypatch.setattr(e_stop.ros, 'take_raw', lambda _: None)
-    monkeypatch.setattr(e_stop.ros, 'introspect', lambda *_: None)
+    monkeypatch.setattr(e_stop_topic.output, 'announce', said.append)
+    monkeypatch.setattr(e_stop_topic.ros, 'polled', lambda *_: None)
+    monkeypatch.setattr(e_stop_topic.ros, 'take_raw', lambda _: None)
+    monkeypatch.setattr(e_stop_topic.ros, 'introspect', lambda *_: None)
     publisher = SimpleNamespace(publish=lambda message: None)
     node: Any = SimpleNamespace(
         create_publisher=lambda *_: publisher, create_service=lambda *_: None
     )
     machine = OperatingStateMachine()
-    latch = e_stop.EStop(node, machine, button=-1)
+    latch = e_stop_topic.EStop(node, machine, button=-1)
     for _ in range(2):
         machine.press()
         latch.confirm()
@@ -115,9 +115,9 @@ def test_key_works_after_an_error_of_the_node(monkeypatch: pytest.MonkeyPatch) -
 
     rejections = SimpleNamespace(add=lambda topic, error: counted.append(error))
     context = SimpleNamespace(ok=lambda: len(polls) < 3)
-    monkeypatch.setattr(e_stop, 'POLL_PERIOD_S', 0.001)
+    monkeypatch.setattr(e_stop_topic, 'POLL_PERIOD_S', 0.001)
     node = SimpleNamespace(context=context, rejections=rejections, poll_e_stop=poll)
-    listener = e_stop.Listener.__new__(e_stop.Listener)
+    listener = e_stop_topic.Listener.__new__(e_stop_topic.Listener)
     listener._node, listener._pipe = node, False
     listener._run()
     assert len(counted) == 3

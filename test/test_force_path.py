@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rig import FRAME, MS, PROFILE, QUIET, RADIUS, UNIT, K, Rig, lowered, pressed, spoiled
 
-from cutting_trainer.haptic_bridge.chain import INSIDE, NONE, TOUCHING
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,

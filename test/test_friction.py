@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flat_tissue import flat_surface
 
-from cutting_trainer.haptic_bridge.chain import NONE, TOUCHING
+from cutting_trainer.haptic_bridge.force_kernels import NONE, TOUCHING
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.proxy.friction import (
     STICK,
@@ -14,7 +14,7 @@ from cutting_trainer.haptic_bridge.proxy.friction import (
 )
 from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,

@@ -19,8 +19,8 @@ from bench.trials.fuzz_verdict import (
     busiest_second,
     problems,
 )
+from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.node_process import _Log
-from cutting_trainer.session.status import Status
 
 messages = pytest.importorskip('cutting_trainer_msgs.msg')
 

@@ -7,7 +7,7 @@ import pytest
 from meshes import box
 
 from cutting_trainer.node_common.errors import MeshError
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material

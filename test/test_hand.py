@@ -8,10 +8,10 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings, HandSettings
-from cutting_trainer.haptic_bridge.settings import SettingsError, Transform
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings, HandSettings
+from cutting_trainer.haptic_bridge.scene_schema import SettingsError, Transform
 from cutting_trainer.node_common.errors import SceneError
-from cutting_trainer.node_common.scene_file import read_section
+from cutting_trainer.node_common.scene_reader import read_section
 
 
 def hand_on(*phases, seconds=1.0, transform=None, tremor=0.0, seed=0, **start):

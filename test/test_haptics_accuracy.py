@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from bench.haptics.accuracy import MOTIONS, PLACES, Bench, measure, missed_bounds
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 
 pytestmark = pytest.mark.long
 

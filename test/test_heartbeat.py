@@ -21,7 +21,7 @@ from test_supervisor import (
     wait_for_line,
 )
 
-from cutting_trainer.session.graph import CUTTING_NODE, node_command, node_environment
+from cutting_trainer.session.node_commands import CUTTING_NODE, node_command, node_environment
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.supervisor import Event, Supervisor
 

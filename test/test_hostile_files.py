@@ -13,13 +13,13 @@ from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.message_class import message_class
 from cutting_trainer.bags.message_text import SEPARATOR
 from cutting_trainer.bags.metadata import read_metadata
-from cutting_trainer.bags.plain_yaml import load_yaml
 from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.untrusted_yaml import load_yaml
 from cutting_trainer.cli import main as cli
-from cutting_trainer.haptic_bridge.settings import DeviceProfile, SettingsError, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceProfile, SettingsError, ToolSettings
 from cutting_trainer.node_common.errors import SceneError
-from cutting_trainer.node_common.scene_file import read_section
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 pytestmark = pytest.mark.long
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from bench.common.meshes import kuhn_block
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.mesh_import import mesher
@@ -18,9 +18,9 @@ from cutting_trainer.mesh_import.import_mesh import SIDES, ImportOptions, import
 from cutting_trainer.mesh_import.imported_scene import height
 from cutting_trainer.mesh_import.surface_import import read_surface
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.in_process import InProcess, Tissue
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.tool import ContactState
 

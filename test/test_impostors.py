@@ -9,7 +9,7 @@ from bridge_world import Record, World, session
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 
-from cutting_trainer.haptic_bridge.chain import INSIDE
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec
 

@@ -8,9 +8,9 @@ from bench.haptics.pages import run_accuracy, run_stability
 from bench.speed.script import run_script
 from bench.speed.strokes import Session
 from cutting_trainer.cutting.combined import CombinedMethod
-from cutting_trainer.cutting.method import SweepError
+from cutting_trainer.cutting.method_interface import SweepError
 from cutting_trainer.haptic_bridge.force_path import ForcePath
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.in_process import InProcess, LinkSettings, Tissue
 from cutting_trainer.tissue_sim.contact.blade import Resistance

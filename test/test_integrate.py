@@ -15,10 +15,10 @@ from test_docs import made
 
 from bench.reference import topics as topic_reference
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
-from cutting_trainer.session.graph import (
+from cutting_trainer.session.node_commands import (
     BRIDGE_NODE,
     CUTTING_NODE,
     TISSUE_NODE,
@@ -72,7 +72,7 @@ def offered() -> dict[str, QoSProfile]:
     found = {}
     folders = ('node_common', 'tissue_sim', 'haptic_bridge')
     nodes = [path for folder in folders for path in (ROOT / folder).rglob('*.py')]
-    others = ('viewer/node.py', 'viewer/operation.py', 'cutting/node.py')
+    others = ('viewer/node.py', 'viewer/operator_commands.py', 'cutting/node.py')
     for path in [*nodes, *(ROOT / name for name in others)]:
         if path.name in ('probe_node.py', 'omni_node.py'):
             continue

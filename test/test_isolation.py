@@ -12,8 +12,8 @@ import pytest
 from live import ROOT, free_domain, node_words, running, two_presses, write_scene
 
 from bench.graph.impaired_link import TwoHosts, missing_rights
-from cutting_trainer.session.graph import MODULES, node_environment
 from cutting_trainer.session.network import Network, network_environment
+from cutting_trainer.session.node_commands import MODULES, node_environment
 
 pytest.importorskip('rclpy')
 pytestmark = [

@@ -8,8 +8,14 @@ from typing import Any, get_args
 
 import pytest
 
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
-from cutting_trainer.session.graph import MODULES, PROFILES, RANGE, node_environment, session_nodes
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
+from cutting_trainer.session.node_commands import (
+    MODULES,
+    PROFILES,
+    RANGE,
+    node_environment,
+    session_nodes,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -6,9 +6,9 @@ from meshes import irregular_box
 
 from bench.accuracy.law_problems import CASES, settled, unstructured_block
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
-from cutting_trainer.tissue_sim.elasticity.law_equilibrium import LawEquilibrium
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.elasticity.stiffening_equilibrium import LawEquilibrium
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 

@@ -67,9 +67,9 @@ def test_every_room_imports_only_from_rooms_below_it(folder: str) -> None:
 @pytest.mark.parametrize(
     ('module', 'code'),
     [
-        ('tissue_sim.mesh.files', 'from cutting_trainer.tissue_sim.settings import Material'),
+        ('tissue_sim.mesh.files', 'from cutting_trainer.tissue_sim.scene_schema import Material'),
         ('node_common.ros', 'import cutting_trainer.tissue_sim.mesh.replica'),
-        ('haptic_bridge.node', 'from cutting_trainer.cutting import methods'),
+        ('haptic_bridge.node', 'from cutting_trainer.cutting import method_registry'),
         ('cutting.node', 'from cutting_trainer import haptic_bridge'),
         ('cli.main', 'def late():\n    from bench.speed import command'),
     ],

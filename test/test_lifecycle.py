@@ -20,7 +20,7 @@ from rclpy.node import Node
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
 from cutting_trainer.node_common.qos import NEWEST_BEST_EFFORT
 from cutting_trainer.node_common.ros import polled, take_raw
-from cutting_trainer.session.graph import MODULES, node_environment
+from cutting_trainer.session.node_commands import MODULES, node_environment
 
 pytestmark = pytest.mark.long
 

@@ -49,8 +49,8 @@ from rosbags.highlevel import AnyReader
 from cutting_trainer.bags.reader import Recorded, open_bag
 from cutting_trainer.bags.repair import repair_bag
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec
-from cutting_trainer.session.graph import node_environment
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import node_environment
 
 pytestmark = pytest.mark.real_time
 
@@ -93,7 +93,7 @@ def session(tmp_path: Path, domain: int) -> Iterator[LiveSession]:
 def witness(tmp_path: Path, domain: int) -> Iterator['subprocess.Popen[str]']:
     """Another recorder in the domain of the session, ready to hear."""
     arguments = ['-r', '__node:=witness', '-p', f'bag:={tmp_path / "seen"}']
-    command = node_words('cutting_trainer.bags.node', *arguments)
+    command = node_words('cutting_trainer.bags.recorder_node', *arguments)
     with running(command, node_environment(domain), 'ready: witness') as witness:
         yield witness
 

@@ -25,7 +25,7 @@ from live import (
     write_scene,
 )
 
-from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.node_commands import node_environment
 
 pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 

@@ -23,10 +23,10 @@ from live import (
 from meshes import irregular_box
 
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.cutting.checks import check_mesh, cut_faces
+from cutting_trainer.cutting.cut_invariants import check_mesh, cut_faces
 from cutting_trainer.node_common.ros import FORCE, take
-from cutting_trainer.session.graph import node_environment
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import node_environment
 from cutting_trainer.tissue_sim.contact.tool import ContactState
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh

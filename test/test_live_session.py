@@ -29,11 +29,11 @@ from live import (
 from rosbags.highlevel import AnyReader
 
 from cutting_trainer.bags.comparison import compare
-from cutting_trainer.bags.frames import read_frames
 from cutting_trainer.bags.metadata import read_metadata, recorded_code
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.topics import CUTS, DIAGNOSTICS
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.topic_names import CUTS, DIAGNOSTICS
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
@@ -42,9 +42,9 @@ from cutting_trainer.node_common.cdr_codec import (
 )
 from cutting_trainer.node_common.code_identity import identity_here
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import pose_check, recomputation
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.recordings.resimulate_command import pose_check, recomputation
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
 pytestmark = pytest.mark.real_time

@@ -20,7 +20,7 @@ from cutting_trainer.tissue_sim.mesh.checks import (
     select_fixed,
 )
 from cutting_trainer.tissue_sim.mesh.files import load_mesh
-from cutting_trainer.tissue_sim.settings import FixedRegion, MaterialSettings, TissueSettings
+from cutting_trainer.tissue_sim.scene_schema import FixedRegion, MaterialSettings, TissueSettings
 
 MESHES = Path(__file__).resolve().parents[1] / 'config' / 'meshes'
 SHIPPED = sorted(MESHES.glob('*.msh'))

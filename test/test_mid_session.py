@@ -11,24 +11,24 @@ import pytest
 from bag_copies import rewritten
 from made_session import PERIOD, make_session, watched
 
-from cutting_trainer.bags.beginning import find_beginning
 from cutting_trainer.bags.comparison import Comparison, compare
-from cutting_trainer.bags.frames import contact_message, read_frames
 from cutting_trainer.bags.reader import Recorded, open_bag
+from cutting_trainer.bags.recorded_frames import contact_message, read_frames
 from cutting_trainer.bags.resimulation import Resimulation
-from cutting_trainer.bags.topics import FORCE, MEMORY, POSE, STATE
+from cutting_trainer.bags.resimulation_start import find_beginning
+from cutting_trainer.bags.topic_names import FORCE, MEMORY, POSE, STATE
 from cutting_trainer.cli import main as cli
 from cutting_trainer.cutting.memory import from_state as memory_of
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec, StampedMessage
-from cutting_trainer.recordings.experiment import Hand, closed_loop, recorded_run, run_experiment
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import pose_check, recomputation
-from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.recordings.resimulate_command import pose_check, recomputation
+from cutting_trainer.recordings.what_if import Hand, closed_loop, recorded_run, run_experiment
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
 from cutting_trainer.tissue_sim.contact.tool import ContactState, Frame
-from cutting_trainer.tissue_sim.simulation.object_state import (
+from cutting_trainer.tissue_sim.simulation.serialisation import (
     ObjectState,
     StateError,
     capture,
@@ -221,7 +221,7 @@ def test_both_sides_of_the_table_begin_after_the_frame_before_the_state(
     assert stamps[0] <= before.stamp_ns
     within = [s for s in stamps if before.stamp_ns < s <= records[-1].pose.stamp_ns]
     monkeypatch.setattr(
-        'cutting_trainer.recordings.experiment._at',
+        'cutting_trainer.recordings.what_if._at',
         lambda bag, topic, codec, times: np.ones((len(times), 99)),
     )
     recorded, differs = recorded_run(bag, recomputation(scene, beginning))

@@ -13,10 +13,10 @@ from cutting_trainer_msgs.msg import Contact
 from live import PATIENCE, ROOT, LiveSession, free_domain, onlooker, wait_for
 from ruamel.yaml import YAML
 
-from cutting_trainer.bags.beginning import find_beginning
-from cutting_trainer.bags.frames import read_frames
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.topics import INPUTS
+from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.resimulation_start import find_beginning
+from cutting_trainer.bags.topic_names import INPUTS
 from cutting_trainer.cli import main as cli
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec
 from cutting_trainer.node_common.ros import CONTACT, take_raw

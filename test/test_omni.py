@@ -9,7 +9,7 @@ import pytest
 from live import node_words, running
 
 from cutting_trainer.haptic_bridge.devices.omni import ForceLatch, OmniConvention
-from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.node_commands import node_environment
 
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = 90

@@ -20,7 +20,7 @@ from test_supervisor import FAKE, ROOT, Ledger, ledger, wait_for
 
 from bench.figures.trust_output import watch
 from cutting_trainer.node_common.timing import MAX_TIMELY_LATENESS_S
-from cutting_trainer.session.graph import ARM_NODE, BRIDGE_NODE
+from cutting_trainer.session.node_commands import ARM_NODE, BRIDGE_NODE
 
 __all__ = ['ledger']
 FLOOD = 20_000

@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from cutting_trainer.node_common.share import is_checkout, share_folder
-from cutting_trainer.session.graph import MODULES, PROFILES, RANGE
+from cutting_trainer.node_common.share_folder import is_checkout, share_folder
+from cutting_trainer.session.node_commands import MODULES, PROFILES, RANGE
 
 pytestmark = pytest.mark.long
 
@@ -171,12 +171,12 @@ for name in sys.argv[2:]:
 CORE = (
     'cutting_trainer.tissue_sim.assembly',
     'cutting_trainer.tissue_sim.mesh.replica',
-    'cutting_trainer.cutting.methods',
+    'cutting_trainer.cutting.method_registry',
     'cutting_trainer.haptic_bridge.force_path',
     'cutting_trainer.haptic_bridge.emulated_arm.arm',
     'cutting_trainer.bags.comparison',
     'cutting_trainer.session.in_process',
-    'cutting_trainer.recordings.resimulate',
+    'cutting_trainer.recordings.resimulate_command',
     'bench.trials.chaos_verdict',
 )
 
@@ -237,11 +237,11 @@ def test_installed_trainer_finds_scenes_devices_and_profiles(clone: Path, tmp_pa
     }
     share = tmp_path / 'share' / 'cutting_trainer'
     code = (
-        'from cutting_trainer.session import demo, graph, scene\n'
+        'from cutting_trainer.session import demo_command, node_commands, scene_loader\n'
         'from pathlib import Path\n'
-        'print(scene.load_scene("liver").path)\n'
-        'print(graph.node_environment(0)["FASTRTPS_DEFAULT_PROFILES_FILE"])\n'
-        'print(demo.SESSIONS.resolve())\n'
+        'print(scene_loader.load_scene("liver").path)\n'
+        'print(node_commands.node_environment(0)["FASTRTPS_DEFAULT_PROFILES_FILE"])\n'
+        'print(demo_command.SESSIONS.resolve())\n'
     )
     environ = os.environ | {'PYTHONPATH': str(site)}
     for variable in (RANGE, PROFILES):
@@ -295,10 +295,10 @@ def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(
     run(colcon, 'build', *options)
     script = (
         f'from cutting_trainer import {", ".join(ROOMS)}\n'
-        'from cutting_trainer.session import scene\n'
+        'from cutting_trainer.session import scene_loader\n'
         'from cutting_trainer_msgs.msg import Mesh\n'
         'from cutting_trainer_msgs.srv import Cut\n'
-        'print(tissue_sim.__file__, scene.SCENES, Mesh.CUT, Cut.Request.ADVANCE)\n'
+        'print(tissue_sim.__file__, scene_loader.SCENES, Mesh.CUT, Cut.Request.ADVANCE)\n'
     )
     sourced = f'. install/setup.sh && exec {sys.executable} -'
     shell = subprocess.run(

@@ -14,7 +14,7 @@ import pytest
 from page_world import StandIn
 
 from bench.page.browser import CHROMIUM, Browser, Page, chromium
-from cutting_trainer.viewer.protocol import EStop, Guide, Play, ResetEStop, Seek
+from cutting_trainer.viewer.page_protocol import EStop, Guide, Play, ResetEStop, Seek
 
 pytestmark = [
     pytest.mark.long,

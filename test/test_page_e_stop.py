@@ -8,7 +8,7 @@ from websockets.exceptions import ConnectionClosed
 from bench.common.waiting import until
 from bench.page.open_page import OpenPage
 from bench.page.stand_in import StandIn
-from cutting_trainer.viewer.gate import PageLimits
+from cutting_trainer.viewer.access_control import PageLimits
 
 pytestmark = pytest.mark.long
 

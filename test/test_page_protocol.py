@@ -14,14 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.datastructures import Headers
 
-from bench.page.fuzz import text
+from bench.page.fuzz_socket import text
 from bench.page.stand_in import CONTROLS, GATE, TOKEN, VALID
-from cutting_trainer.viewer.controls import ReplayControls
-from cutting_trainer.viewer.gate import Bucket, PageError, is_local, link, make_gate
+from cutting_trainer.viewer.access_control import Bucket, PageError, is_local, link, make_gate
+from cutting_trainer.viewer.allowed_requests import ReplayControls
 from cutting_trainer.viewer.live_page import plain
+from cutting_trainer.viewer.page_protocol import ProtocolError, parse
 from cutting_trainer.viewer.page_state import PageState, ReceivedVersions, TissueFrame
-from cutting_trainer.viewer.protocol import ProtocolError, parse
-from cutting_trainer.viewer.waiting import taken
+from cutting_trainer.viewer.pending_requests import taken
 
 REPLAYED: dict[str, dict[str, Any]] = {
     'play': {'on': True},

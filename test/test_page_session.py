@@ -23,7 +23,7 @@ from live import Recording, two_presses, write_scene
 from page_user import RIGHT, ROOT, UP, View, sessions, start, way
 
 from bench.page.browser import CHROMIUM, Page, chromium
-from cutting_trainer.haptic_bridge.chain import INSIDE
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 
 pytestmark = [

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from cutting_trainer.node_common.parameters import parameter, seed_parameter
-from cutting_trainer.node_common.share import PACKAGES
+from cutting_trainer.node_common.share_folder import PACKAGES
 
 
 def made(**values: object) -> Iterator[Node]:

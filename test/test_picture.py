@@ -8,7 +8,7 @@ from cutting_trainer_msgs.msg import Mesh, MeshDelta
 from rclpy.serialization import serialize_message
 
 from cutting_trainer.bags.message_text import schema_text
-from cutting_trainer.bags.qos import OfferedQos
+from cutting_trainer.bags.recorded_qos import OfferedQos
 from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
 from cutting_trainer.recordings import picture

@@ -10,7 +10,7 @@ from meshes import box
 from bench.accuracy.plan_check import deep_error, script_presses, settlement_error
 from bench.accuracy.quadratic import QuadraticTissue
 from cutting_trainer.cli.plan_report import as_data, report
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation, make_task
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh

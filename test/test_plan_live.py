@@ -23,10 +23,10 @@ from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.recordings.html_report import write_report
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import pose_check, recomputation
+from cutting_trainer.recordings.resimulate_command import pose_check, recomputation
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import node_environment
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.node_commands import node_environment
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact, indenter_contact
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta

@@ -6,8 +6,8 @@ import pytest
 from pydantic import ValidationError
 
 from bench.reference import materials
-from cutting_trainer.tissue_sim.presets import PRESETS, PresetName
-from cutting_trainer.tissue_sim.settings import MaterialSettings
+from cutting_trainer.tissue_sim.material_presets import PRESETS, PresetName
+from cutting_trainer.tissue_sim.scene_schema import MaterialSettings
 
 PLACES = ('doi 10.', 'arXiv ', 'thesis', '.com/', 'preprint')
 

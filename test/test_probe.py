@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cutting_trainer.haptic_bridge.devices.probe import (
+from cutting_trainer.haptic_bridge.devices.probe_force import check_push
+from cutting_trainer.haptic_bridge.devices.probe_stream import (
     PUSH_FORCE_N,
     REQUESTED_MOVE_M,
     Poses,
@@ -14,8 +15,7 @@ from cutting_trainer.haptic_bridge.devices.probe import (
     check_stream,
     find_move,
 )
-from cutting_trainer.haptic_bridge.devices.probe_force import check_push
-from cutting_trainer.haptic_bridge.settings import DeviceProfile
+from cutting_trainer.haptic_bridge.scene_schema import DeviceProfile
 
 PROFILE = DeviceProfile(max_force=1, max_slew=100, max_stiffness=100, workspace=(0.2, 0.2, 0.2))
 START = 1.7e9

@@ -14,9 +14,9 @@ from cutting_trainer.cli import main as cli
 from cutting_trainer.haptic_bridge.devices import probe_node
 from cutting_trainer.node_common.qos import STREAM
 from cutting_trainer.node_common.ros import polled, take
-from cutting_trainer.session import probe as command
-from cutting_trainer.session.probe import Emulation, ProbeOptions, run_probe
-from cutting_trainer.session.status import Status
+from cutting_trainer.session import probe_command as command
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.probe_command import Emulation, ProbeOptions, run_probe
 
 pytestmark = pytest.mark.real_time
 

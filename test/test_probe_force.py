@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cutting_trainer.haptic_bridge.devices import probe_node
-from cutting_trainer.haptic_bridge.devices.probe import ProbeCheck
 from cutting_trainer.haptic_bridge.devices.probe_force import check_gain, check_push, check_release
 from cutting_trainer.haptic_bridge.devices.probe_node import DeviceProbe, Pushes
 from cutting_trainer.haptic_bridge.devices.probe_pose import (
@@ -21,11 +20,12 @@ from cutting_trainer.haptic_bridge.devices.probe_pose import (
     check_ruler,
     find_rotation,
 )
+from cutting_trainer.haptic_bridge.devices.probe_stream import ProbeCheck
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
 from cutting_trainer.haptic_bridge.emulated_arm.faults import DriverFaults
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
-from cutting_trainer.haptic_bridge.settings import Transform
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
+from cutting_trainer.haptic_bridge.scene_schema import Transform
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
 
 pytestmark = pytest.mark.long

@@ -19,7 +19,7 @@ from cutting_trainer.node_common.publishers import (
     full_name,
 )
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.node_commands import node_environment
 
 ARM, AGAIN, THIEF = Publisher(b'a', '/arm'), Publisher(b'b', '/arm'), Publisher(b'c', '/thief')
 

@@ -23,18 +23,17 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Joy
 
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.player import (
-    STEP_S,
-    Playhead,
+from cutting_trainer.bags.playback_control import STEP_S, Playhead
+from cutting_trainer.bags.playback_messages import (
     ReadAhead,
     RecordedHand,
     RecordedStream,
     duration,
 )
-from cutting_trainer.bags.player_node import HandPlayer, SessionPlayer
+from cutting_trainer.bags.playback_publishers import HandPlayer, SessionPlayer
+from cutting_trainer.bags.qos_adaptation import publisher_qos
 from cutting_trainer.bags.reader import Bag, Recorded, open_bag
-from cutting_trainer.bags.ros_qos import publisher_qos
-from cutting_trainer.bags.topics import (
+from cutting_trainer.bags.topic_names import (
     BUTTON,
     CONTACT,
     FORCE,
@@ -49,7 +48,7 @@ from cutting_trainer.bags.topics import (
 )
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.operating_state import crtk_types
-from cutting_trainer.recordings.replay import _Over, handle_keys, replay_nodes
+from cutting_trainer.recordings.replay_command import _Over, handle_keys, replay_nodes
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
@@ -457,7 +456,7 @@ def test_the_recorded_hand_cuts_the_tissue_again(tmp_path: Path) -> None:
 
 
 def test_a_start_beyond_the_end_is_refused() -> None:
-    from cutting_trainer.recordings.replay import ReplayOptions, replay
+    from cutting_trainer.recordings.replay_command import ReplayOptions, replay
 
     options = ReplayOptions(SAMPLE, True, 1.0, 1e4, False, 'free', None, False)
     with pytest.raises(SessionError, match='the session lasts'):

@@ -13,12 +13,12 @@ from pyarrow import parquet as pq
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.tissue import tissue_at
-from cutting_trainer.bags.topics import FORCE, MESH, SERVO_CF
+from cutting_trainer.bags.recorded_tissue import tissue_at
+from cutting_trainer.bags.topic_names import FORCE, MESH, SERVO_CF
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec
-from cutting_trainer.recordings.export import export
+from cutting_trainer.recordings.export_command import export
 from cutting_trainer.recordings.html_report import force_peaks, incision_area, write_report
-from cutting_trainer.recordings.incision import (
+from cutting_trainer.recordings.incision_metrics import (
     distance_to_paths,
     extent,
     planned_paths,
@@ -26,7 +26,7 @@ from cutting_trainer.recordings.incision import (
 )
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh

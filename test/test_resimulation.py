@@ -16,23 +16,32 @@ from rich.console import Console
 
 from cutting_trainer.bags.comparison import MAX_ROUNDING, Comparison, compare
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.frames import read_frames
 from cutting_trainer.bags.message_class import message_class
 from cutting_trainer.bags.reader import Recorded, open_bag
+from cutting_trainer.bags.recorded_frames import read_frames
 from cutting_trainer.bags.repair import copy_bag
 from cutting_trainer.bags.resimulation import answer_frames, as_recorded
-from cutting_trainer.bags.topics import CONTACT, CUTS, FORCE, INPUTS, MESH, POSE, SERVO_CF, UPDATES
+from cutting_trainer.bags.topic_names import (
+    CONTACT,
+    CUTS,
+    FORCE,
+    INPUTS,
+    MESH,
+    POSE,
+    SERVO_CF,
+    UPDATES,
+)
 from cutting_trainer.cli import main as cli
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec, WrenchStampedCodec
 from cutting_trainer.node_common.code_identity import identity_here
 from cutting_trainer.node_common.stamps import nanoseconds
-from cutting_trainer.recordings import view_bag
-from cutting_trainer.recordings.experiment import Run, recorded_run, run_experiment
+from cutting_trainer.recordings import view_bag_command
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate import pose_check, recomputation, verdict
-from cutting_trainer.session.changed_scene import parse_changes
+from cutting_trainer.recordings.resimulate_command import pose_check, recomputation, verdict
+from cutting_trainer.recordings.what_if import Run, recorded_run, run_experiment
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.scene_overrides import parse_changes
 
 pytestmark = pytest.mark.long
 
@@ -419,7 +428,7 @@ def test_a_frame_that_the_bag_lacks_ends_every_computation_in_one_sentence(
     lacks = f'lacks frame {gone.step}: '
     for changed in (False, True):
         with pytest.raises(BagError, match=lacks):
-            view_bag.resimulated(bag, scene, Console(quiet=True), changed=changed)
+            view_bag_command.resimulated(bag, scene, Console(quiet=True), changed=changed)
     with pytest.raises(BagError, match=lacks):
         recorded_run(bag, recomputation(scene))
     left = [record for record in read_frames(source) if record.step != gone.step]

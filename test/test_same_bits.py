@@ -10,7 +10,7 @@ pytestmark = pytest.mark.long
 
 PRESS = """
 import numpy as np
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceSettings,
     HapticsSettings,
     ToolSettings,
     check_together,
 )
 from cutting_trainer.node_common.errors import SceneError
-from cutting_trainer.node_common.scene_file import SECTIONS, SceneModel, read_section
+from cutting_trainer.node_common.scene_reader import SECTIONS, SceneModel, read_section
 from cutting_trainer.tissue_sim.assembly import load_tissue
 from cutting_trainer.tissue_sim.mesh.checks import FACES
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 pytestmark = pytest.mark.long
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from cutting_trainer.session import demo
-from cutting_trainer.session.demo import DemoOptions, run_demo
+from cutting_trainer.session import demo_command
+from cutting_trainer.session.demo_command import DemoOptions, run_demo
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.graph import MODULES
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import MODULES
 from cutting_trainer.session.node_process import NodeCommand
-from cutting_trainer.session.status import Status
 from cutting_trainer.session.summary import Summary
 
 FAKE = Path(__file__).with_name('fake_node.py')
@@ -32,7 +32,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
         for name in MODULES:
             argv = (*fake, name, str(tmp_path / 'ledger'), *habits.get(name, '').split())
             nodes.append(NodeCommand(name, argv, records=name == 'recorder'))
-        monkeypatch.setattr(demo, 'session_nodes', lambda *arguments: nodes)
+        monkeypatch.setattr(demo_command, 'session_nodes', lambda *arguments: nodes)
         return run_demo(DemoOptions('block', seconds, tmp_path / 'bag', 0, 'free', False))
 
     return session
@@ -42,9 +42,11 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bag with which everything is all right."""
     summary = Summary('bag', True, 5.0, {}, 1.0, 1.0, 0.0, 0.0, 1, 1, {}, {})
-    monkeypatch.setattr(demo, 'read_evidence', lambda folder: None)
-    monkeypatch.setattr(demo, 'summarise', lambda evidence: summary)
-    monkeypatch.setattr(demo, 'expectations', lambda scene: demo.Expected({}, cut=True))
+    monkeypatch.setattr(demo_command, 'read_evidence', lambda folder: None)
+    monkeypatch.setattr(demo_command, 'summarise', lambda evidence: summary)
+    monkeypatch.setattr(
+        demo_command, 'expectations', lambda scene: demo_command.Expected({}, cut=True)
+    )
 
 
 @pytest.mark.usefixtures('perfect')
@@ -67,7 +69,7 @@ def test_dead_node_is_the_exit_status_even_of_a_session_that_finished(
 def test_script_that_never_ends_is_a_failure(
     run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demo, 'MAX_OVERTIME_S', -4.5)
+    monkeypatch.setattr(demo_command, 'MAX_OVERTIME_S', -4.5)
     assert run() == Status.FAILED
     assert 'did not finish its script' in capsys.readouterr().err
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cutting_trainer.bags.qos import OfferedQos
+from cutting_trainer.bags.recorded_qos import OfferedQos
 from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
-from cutting_trainer.session.evidence import Evidence, Status, read_evidence
-from cutting_trainer.session.judge import Expected, judge
+from cutting_trainer.session.acceptance_criteria import Expected, judge
+from cutting_trainer.session.bag_measurements import Evidence, Status, read_evidence
 from cutting_trainer.session.outcome import Death, Outcome
-from cutting_trainer.session.report import session_tables
+from cutting_trainer.session.result_table import session_tables
 from cutting_trainer.session.summary import Summary, summarise
 
 RATES = {'tissue_sim': 30.0, 'haptic_bridge': 1000.0}

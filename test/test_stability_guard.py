@@ -8,8 +8,8 @@ import pytest
 from meshes import box, irregular_box
 from test_blade import contact_at
 
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling, Tool
 from cutting_trainer.tissue_sim.elasticity.material import Material

@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cutting_trainer.tissue_sim.elasticity.law_chunks import (
+from cutting_trainer.tissue_sim.elasticity.rotation import LANES
+from cutting_trainer.tissue_sim.elasticity.stiffening import (
+    MAX_EXPONENT,
+    MIN_RATIO,
+    blended_difference,
+    linear_stress,
+    stiffening_stress,
+    tangent_bound,
+)
+from cutting_trainer.tissue_sim.elasticity.stiffening_simd import (
     MAX_STRETCH,
     MIN_STRETCH,
     MODULUS,
@@ -17,15 +26,6 @@ from cutting_trainer.tissue_sim.elasticity.law_chunks import (
     VOLUME,
     law_in_lanes,
     tangents_in_lanes,
-)
-from cutting_trainer.tissue_sim.elasticity.rotation import LANES
-from cutting_trainer.tissue_sim.elasticity.stiffening import (
-    MAX_EXPONENT,
-    MIN_RATIO,
-    blended_difference,
-    linear_stress,
-    stiffening_stress,
-    tangent_bound,
 )
 
 MU, LAMBDA, B = 1862.0, 16760.0, 6.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.haptics.stability import (
+from bench.haptics.stability_map import (
     COUPLING_STIFFNESS,
     Cell,
     Outcome,
@@ -15,7 +15,7 @@ from bench.haptics.stability import (
     tip_over,
 )
 from cutting_trainer.haptic_bridge.force_path import ForcePath
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.session.in_process import TICK_S, InProcess, LinkSettings, Tissue
 
 pytestmark = pytest.mark.long

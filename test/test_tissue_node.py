@@ -16,8 +16,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from live import free_domain, two_presses, wait_for, write_scene
 
 from cutting_trainer.node_common import qos, ros
-from cutting_trainer.session.graph import node_environment
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.node_commands import node_environment
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 
 pytestmark = pytest.mark.long

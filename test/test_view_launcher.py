@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from cutting_trainer.session.graph import RECORDER_NODE, TISSUE_NODE, VIEWER_NODE
+from cutting_trainer.session.node_commands import RECORDER_NODE, TISSUE_NODE, VIEWER_NODE
 from cutting_trainer.session.node_process import parse_message
 from cutting_trainer.session.progress import SessionProgress
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.session.supervisor import Event
-from cutting_trainer.session.view import ViewOptions, _Session, run_view
-from cutting_trainer.viewer.gate import PageError
+from cutting_trainer.session.view_command import ViewOptions, _Session, run_view
+from cutting_trainer.viewer.access_control import PageError
 
 pytestmark = pytest.mark.long
 
@@ -94,7 +94,9 @@ def test_scene_of_the_list_is_begun_and_said(launched: Launched) -> None:
 def test_recording_is_named_without_its_folders(
     launched: Launched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr('cutting_trainer.session.view.new_bag', lambda *_: tmp_path / 'block-1')
+    monkeypatch.setattr(
+        'cutting_trainer.session.view_command.new_bag', lambda *_: tmp_path / 'block-1'
+    )
     launched.line('{"ask": "record", "on": true}')
     assert [command.name for command in launched.replaced[-1]] == [RECORDER_NODE]
     assert launched.answers[-1]['recording'] == 'block-1'
@@ -103,7 +105,9 @@ def test_recording_is_named_without_its_folders(
 def test_viewer_reads_a_scene_only_once_it_or_the_nodes_have_started(
     launched: Launched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr('cutting_trainer.session.view.new_bag', lambda *_: tmp_path / 'block-1')
+    monkeypatch.setattr(
+        'cutting_trainer.session.view_command.new_bag', lambda *_: tmp_path / 'block-1'
+    )
 
     def told(ask: str) -> list[str]:
         count = len(launched.answers)

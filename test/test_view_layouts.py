@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 
 from bench.reference.topics import TOPICS, Topic
 from cutting_trainer.node_common.ros import FRAME
-from cutting_trainer.viewer.frames import DEVICE_FRAME
+from cutting_trainer.viewer.tf_frames import DEVICE_FRAME
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
 PUBLISHED = {f'/{topic.name.lstrip("/")}': topic for topic in TOPICS}

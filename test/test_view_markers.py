@@ -15,17 +15,18 @@ from scipy.spatial.transform import Rotation
 from strokes import draw, mesh_of, method_named, straight
 from visualization_msgs.msg import Marker, MarkerArray
 
-from cutting_trainer.haptic_bridge.chain import TOUCHING
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, ToolSettings, Vector
+from cutting_trainer.haptic_bridge.force_kernels import TOUCHING
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings, Vector
 from cutting_trainer.node_common.qos import LATCHED
 from cutting_trainer.node_common.ros import STATIC_FRAMES
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.streaming.messages import mesh_message
-from cutting_trainer.viewer import frames
-from cutting_trainer.viewer.appearance import METRES_PER_NEWTON, OPENED, blade, handle
-from cutting_trainer.viewer.frames import StaticFrames, device_frame, publishing_command
+from cutting_trainer.viewer import tf_frames
+from cutting_trainer.viewer.appearance import METRES_PER_NEWTON, blade, handle
+from cutting_trainer.viewer.colours import CUT
 from cutting_trainer.viewer.markers import Colouring, Markers, shades, von_mises
-from cutting_trainer.viewer.moment import Moment
+from cutting_trainer.viewer.tf_frames import StaticFrames, device_frame, publishing_command
+from cutting_trainer.viewer.tool_state import Moment
 
 LARGEST = 0.004
 STAMP = 12_000_000_034
@@ -105,7 +106,7 @@ def test_cut_surface_has_one_colour_of_its_own(replica, moment):
     markers = decoded(replica, moment)
     assert not markers['cut'].colors and len(markers['cut'].points) > 0
     cut = markers['cut'].color
-    assert (cut.r, cut.g, cut.b, cut.a) == pytest.approx((*(c / 255 for c in OPENED), 1))
+    assert (cut.r, cut.g, cut.b, cut.a) == pytest.approx((*(c / 255 for c in CUT), 1))
 
 
 def test_every_marker_is_in_the_frame_of_the_tissue_and_of_one_time(replica, moment):
@@ -189,7 +190,7 @@ def placed(x: float) -> DeviceSettings:
 
 
 def test_static_frames_are_those_of_the_drivers_poses_and_of_the_scene_that_runs(monkeypatch):
-    monkeypatch.setattr(frames, 'TFMessage', SimpleNamespace)
+    monkeypatch.setattr(tf_frames, 'TFMessage', SimpleNamespace)
     talker: Any = Talker()
     static = StaticFrames(talker, placed(0.0))
     for name in ('arm_base', 'tissue', '', 'MTML_base', 'MTML_base'):
@@ -206,7 +207,7 @@ def test_static_frames_are_those_of_the_drivers_poses_and_of_the_scene_that_runs
 
 def test_frames_that_another_node_owns_get_no_second_parent(monkeypatch):
     for kind in (SimpleNamespace, None):
-        monkeypatch.setattr(frames, 'TFMessage', kind)
+        monkeypatch.setattr(tf_frames, 'TFMessage', kind)
         talker: Any = Talker()
         static = StaticFrames(talker, placed(0.0), publish=False)
         static.add_frame('MTML_base')
@@ -215,7 +216,7 @@ def test_frames_that_another_node_owns_get_no_second_parent(monkeypatch):
 
 
 def test_without_tf2_msgs_the_viewer_says_what_publishes_the_frame(monkeypatch):
-    monkeypatch.setattr(frames, 'TFMessage', None)
+    monkeypatch.setattr(tf_frames, 'TFMessage', None)
     talker: Any = Talker()
     StaticFrames(talker, placed(0.1)).add_frame('MTML_base')
     (said,) = talker.said

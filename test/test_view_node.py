@@ -27,12 +27,17 @@ from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.node_common.qos import EVENTS, LATCHED
 from cutting_trainer.node_common.ros import ARM, DIAGNOSTICS, FRAME, HAND, MESH, Diagnostics
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import BRIDGE_NODE, LOCAL, node_environment, viewer_command
+from cutting_trainer.session.node_commands import (
+    BRIDGE_NODE,
+    LOCAL,
+    node_environment,
+    viewer_command,
+)
 from cutting_trainer.session.node_process import parse_message
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.streaming.messages import packed
-from cutting_trainer.viewer.gate import TOKEN_VARIABLE
-from cutting_trainer.viewer.statuses import name_within
+from cutting_trainer.viewer.access_control import TOKEN_VARIABLE
+from cutting_trainer.viewer.diagnostics_table import name_within
 
 pytestmark = pytest.mark.long
 

@@ -18,7 +18,7 @@ from live import MEASURED_CP, SERVO_CF, Recording, two_presses, write_scene
 from page_user import RIGHT, UP, View, cut_coloured, reddish, sessions, start, way
 
 from bench.page.browser import CHROMIUM, Browser, Page, chromium
-from cutting_trainer.haptic_bridge.chain import INSIDE, TOUCHING
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, TOUCHING
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 
 pytestmark = [

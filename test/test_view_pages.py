@@ -15,19 +15,19 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from bench.common.waiting import until
-from bench.page import fuzz as page_fuzz
+from bench.page import fuzz_socket as page_fuzz
 from bench.page import stand_in as page_stand_in
 from bench.page.open_page import OpenPage, session_address
 from bench.page.stand_in import CONTROLS, GATE, VALID, StandIn, sheet, wave
-from cutting_trainer.cutting.settings import CuttingSettings
-from cutting_trainer.haptic_bridge.settings import ToolSettings
-from cutting_trainer.session import demo
-from cutting_trainer.viewer.controls import LiveControls
-from cutting_trainer.viewer.gate import PageError, PageLimits
+from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
+from cutting_trainer.session import demo_command
+from cutting_trainer.viewer.access_control import PageError, PageLimits
+from cutting_trainer.viewer.allowed_requests import LiveControls
+from cutting_trainer.viewer.drawn_surface import TissueSource, cut_edges
 from cutting_trainer.viewer.live_page import METHODS, LivePage, SessionState
 from cutting_trainer.viewer.page_server import PageServer
 from cutting_trainer.viewer.static_files import read_files
-from cutting_trainer.viewer.surfaces import TissueSource, cut_edges
 
 pytestmark = pytest.mark.long
 
@@ -393,7 +393,7 @@ def test_demo_serves_its_page_at_a_free_port_where_the_usual_one_is_taken(
     stand_in: StandIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = stand_in.server.port
-    monkeypatch.setattr(demo, 'PORT', port)
-    assert demo.page_port() == 0
+    monkeypatch.setattr(demo_command, 'PORT', port)
+    assert demo_command.page_port() == 0
     stand_in.server.stop()
-    assert demo.page_port() == port
+    assert demo_command.page_port() == port

@@ -15,19 +15,19 @@ from rich.console import Console
 from bench.page.browser import CHROMIUM, chromium
 from bench.page.open_page import OpenPage
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.player import duration
+from cutting_trainer.bags.playback_messages import duration
 from cutting_trainer.bags.reader import Bag, Recorded, open_bag
-from cutting_trainer.bags.tissue import first_tissue, tissue_at
-from cutting_trainer.bags.topics import CONTACT, MESH, UPDATES
+from cutting_trainer.bags.recorded_tissue import first_tissue, tissue_at
+from cutting_trainer.bags.topic_names import CONTACT, MESH, UPDATES
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 from cutting_trainer.recordings.picture import read_story
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.view_bag import resimulated
-from cutting_trainer.session.graph import LOCAL
-from cutting_trainer.session.scene import Scene, load_scene
-from cutting_trainer.viewer.gate import link, make_gate
+from cutting_trainer.recordings.view_bag_command import resimulated
+from cutting_trainer.session.node_commands import LOCAL
+from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.viewer.access_control import link, make_gate
+from cutting_trainer.viewer.bag_timeline import ComputedTissue, RecordedTissue, RecordedTool
 from cutting_trainer.viewer.replay_page import ReplayPage
-from cutting_trainer.viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
 
 pytestmark = pytest.mark.long
 

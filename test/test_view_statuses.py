@@ -8,11 +8,11 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from cutting_trainer.node_common.rejections import MessageError
+from cutting_trainer.viewer.diagnostics_table import OWN, Statuses
 from cutting_trainer.viewer.node import ViewerNode
-from cutting_trainer.viewer.operation import BRIDGE
-from cutting_trainer.viewer.protocol import Choose, Pause, Scale, Start
-from cutting_trainer.viewer.statuses import OWN, Statuses
-from cutting_trainer.viewer.waiting import Requests
+from cutting_trainer.viewer.operator_commands import BRIDGE
+from cutting_trainer.viewer.page_protocol import Choose, Pause, Scale, Start
+from cutting_trainer.viewer.pending_requests import Requests
 
 
 def array(*names: str, **values: str) -> Any:

@@ -9,9 +9,9 @@ from meshes import irregular_box
 from bench.accuracy.prony import shear_relaxation, uniaxial_creep, uniaxial_relaxation
 from bench.cuts.random_strokes import random_stroke
 from bench.figures.tissue_relaxation import cycle
-from cutting_trainer.cutting.method import Sweep
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_interface import Sweep
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.coupling import FREE, HOLD, Coupling
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material

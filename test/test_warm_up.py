@@ -32,8 +32,8 @@ from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
 from cutting_trainer.haptic_bridge.warm_up import warm_up as warm_up_force_path
 from cutting_trainer.session.in_process import simulate
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.session.warm_up import warm_up_arm
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.compile_kernels import warm_up_arm
 
 scene = load_scene(sys.argv[1])
 session = simulate(sys.argv[1])
@@ -53,7 +53,7 @@ print('not set up:', missing)
 """
 MUCH_CUT = """
 import numpy as np
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from bench.speed.strokes import Session
 from bench.speed.tissue import box, liver_material

@@ -11,7 +11,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from cutting_trainer.haptic_bridge.devices.wiring import Wiring
+from cutting_trainer.haptic_bridge.devices.probe_graph import Wiring
 from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.node_common.qos import EVENTS, LATCHED, NEWEST_BEST_EFFORT, STREAM
 from cutting_trainer.session.domain import reserved_domain

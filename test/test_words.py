@@ -1,6 +1,6 @@
-"""Claims about the words of the source; `bench/words.py` has the list."""
+"""Claims about the words of the source; `bench/terminology.py` has the list."""
 
-from bench.words import replaced_names, summaries_without_verb, what_clauses
+from bench.terminology import replaced_names, summaries_without_verb, what_clauses
 
 
 def test_no_name_has_a_word_for_which_there_is_a_standard_term() -> None:

@@ -16,7 +16,7 @@ from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.planner.candidate import Task
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
-from cutting_trainer.tissue_sim.settings import ActiveRegionSettings, TissueSettings
+from cutting_trainer.tissue_sim.scene_schema import ActiveRegionSettings, TissueSettings
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.warm_up import warm_up, warm_up_method
 

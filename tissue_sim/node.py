@@ -26,7 +26,7 @@ from cutting_trainer.node_common.parameters import (
 )
 from cutting_trainer.node_common.publishers import PublisherMonitor
 from cutting_trainer.node_common.rejections import MessageError
-from cutting_trainer.node_common.scene_file import read_section
+from cutting_trainer.node_common.scene_reader import read_section
 from cutting_trainer.node_common.timing import (
     FRAME_NICENESS,
     FairLock,
@@ -39,7 +39,7 @@ from cutting_trainer.tissue_sim.contact.tool import ContactState, Frame, ToolCon
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.planner.monitor import PlanMonitor
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.simulation.checkpoint import Checkpoint, read_checkpoint
 from cutting_trainer.tissue_sim.simulation.state import state_of
 from cutting_trainer.tissue_sim.streaming import messages

@@ -1,17 +1,17 @@
-"""Appearance of a page: colours, the drawn tool, the floor, the first camera."""
+"""Appearance of a page: the drawn tool, the floor, the first camera."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cutting_trainer.haptic_bridge.settings import ToolSettings
-from cutting_trainer.viewer.controls import Bounds
-from cutting_trainer.viewer.moment import Floats, Moment
+from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
+from cutting_trainer.viewer.allowed_requests import Bounds
+from cutting_trainer.viewer.colours import CUT, TISSUE, Colour
+from cutting_trainer.viewer.tool_state import Floats, Moment
 
 Indices = NDArray[np.int64]
 
-TISSUE, OPENED, OTHER_TISSUE = (205, 118, 100), (120, 8, 22), (120, 140, 190)
 METRES_PER_NEWTON = 0.02
 """[m/N] Length of the force's arrow."""
 FIELD_OF_VIEW_RAD = 0.9
@@ -67,7 +67,7 @@ def reach(positions: Floats) -> Bounds:
 
 
 def shown_tissue(
-    name: str, label: str, colour: tuple[int, int, int] = TISSUE, offset: float = 0.0
+    name: str, label: str, colour: Colour = TISSUE, offset: float = 0.0
 ) -> dict[str, Any]:
     """Return a tissue in the format of the message `hello`.
 
@@ -81,7 +81,7 @@ def shown_tissue(
         'name': name,
         'label': label,
         'colour': colour,
-        'cut_colour': OPENED,
+        'cut_colour': CUT,
         'offset': [offset, 0.0, 0.0],
     }
 

@@ -7,12 +7,13 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from cutting_trainer.cutting.settings import CuttingSettings
-from cutting_trainer.haptic_bridge.chain import INSIDE
-from cutting_trainer.haptic_bridge.settings import ToolSettings
+from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE
+from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.viewer import plots
+from cutting_trainer.viewer.allowed_requests import LiveControls
 from cutting_trainer.viewer.appearance import (
     FLOOR,
     METRES_PER_NEWTON,
@@ -21,12 +22,11 @@ from cutting_trainer.viewer.appearance import (
     shown_tissue,
     tool_shape,
 )
-from cutting_trainer.viewer.controls import LiveControls
-from cutting_trainer.viewer.history import History
-from cutting_trainer.viewer.moment import Moment
+from cutting_trainer.viewer.drawn_surface import TissueSource
+from cutting_trainer.viewer.page_protocol import MAX_NAME, VERSION
 from cutting_trainer.viewer.page_server import PageServer
-from cutting_trainer.viewer.protocol import MAX_NAME, VERSION
-from cutting_trainer.viewer.surfaces import TissueSource
+from cutting_trainer.viewer.ring_buffers import History
+from cutting_trainer.viewer.tool_state import Moment
 
 TITLE = 'Cutting trainer'
 METHODS: tuple[str, ...] = get_args(CuttingSettings.model_fields['method'].annotation)

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
-from cutting_trainer.viewer.appearance import OPENED, arrow
-from cutting_trainer.viewer.moment import Floats, Moment
+from cutting_trainer.viewer.appearance import arrow
+from cutting_trainer.viewer.colours import CUT
+from cutting_trainer.viewer.tool_state import Floats, Moment
 
 Colouring = Literal['displacement', 'von_mises']
 ARROW, SPHERE, LINE_LIST, TRIANGLE_LIST = 0, 2, 5, 11
@@ -20,7 +21,7 @@ ADD, DELETE = 0, 2
 """Constants of `visualization_msgs/Marker`."""
 _SHADES = np.asarray(mpl.colormaps['viridis'](np.linspace(0, 1, 256)), np.float32)
 _PLAIN = (1.0, 1.0, 1.0, 1.0)
-_CUT_COLOUR = (*(c / 255 for c in OPENED), 1.0)
+_CUT_COLOUR = (*(c / 255 for c in CUT), 1.0)
 _BLADE, _PROXY, _FORCE = (0.45, 0.5, 0.58, 1.0), (0.16, 0.59, 0.35, 0.6), (0.12, 0.35, 0.86, 1.0)
 _BLADE_WIDTH, _SHAFT, _HEAD = 0.0012, 0.0016, 0.0044
 

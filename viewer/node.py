@@ -16,28 +16,25 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from visualization_msgs.msg import MarkerArray
 
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ContactCodec, PoseStampedCodec, WrenchStampedCodec
 from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.node_common.output import announce
 from cutting_trainer.node_common.parameters import parameter, scene_parameter
-from cutting_trainer.node_common.scene_file import read_section
-from cutting_trainer.node_common.share import scene_names
+from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.node_common.share_folder import scene_names
 from cutting_trainer.node_common.timing import PeriodicLoop
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.streaming.mesh_follower import MeshFollower
-from cutting_trainer.viewer.controls import LiveControls
-from cutting_trainer.viewer.frames import StaticFrames
-from cutting_trainer.viewer.gate import TOKEN_VARIABLE, is_local, link, make_gate
-from cutting_trainer.viewer.history import StreamRate
+from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, is_local, link, make_gate
+from cutting_trainer.viewer.allowed_requests import LiveControls
+from cutting_trainer.viewer.diagnostics_table import Statuses
 from cutting_trainer.viewer.live_page import METHODS, LivePage, SessionState
 from cutting_trainer.viewer.markers import Colouring, Markers
-from cutting_trainer.viewer.moment import Moment, Translator
-from cutting_trainer.viewer.operation import BRIDGE, Operation
-from cutting_trainer.viewer.page_server import PageServer
-from cutting_trainer.viewer.protocol import (
+from cutting_trainer.viewer.operator_commands import BRIDGE, Operation
+from cutting_trainer.viewer.page_protocol import (
     AnyMessage,
     Choose,
     EStop,
@@ -49,9 +46,12 @@ from cutting_trainer.viewer.protocol import (
     Scale,
     Start,
 )
-from cutting_trainer.viewer.statuses import Statuses
-from cutting_trainer.viewer.streams import Stream
-from cutting_trainer.viewer.waiting import Requests, taken
+from cutting_trainer.viewer.page_server import PageServer
+from cutting_trainer.viewer.pending_requests import Requests, taken
+from cutting_trainer.viewer.ring_buffers import StreamRate
+from cutting_trainer.viewer.tf_frames import StaticFrames
+from cutting_trainer.viewer.tool_state import Moment, Translator
+from cutting_trainer.viewer.topic_rate import Stream
 
 MARKER_PERIOD_S = 0.1
 """[s] between two marker messages."""

@@ -22,10 +22,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.protocol import State
 
-from cutting_trainer.viewer.controls import Controls
-from cutting_trainer.viewer.gate import Bucket, Gate, PageError, PageLimits
-from cutting_trainer.viewer.page_state import PageState, ReceivedVersions, TissueFrame
-from cutting_trainer.viewer.protocol import (
+from cutting_trainer.viewer.access_control import Bucket, Gate, PageError, PageLimits
+from cutting_trainer.viewer.allowed_requests import Controls
+from cutting_trainer.viewer.page_protocol import (
     MAX_MESSAGE,
     AnyMessage,
     EStop,
@@ -34,6 +33,7 @@ from cutting_trainer.viewer.protocol import (
     ProtocolError,
     parse,
 )
+from cutting_trainer.viewer.page_state import PageState, ReceivedVersions, TissueFrame
 from cutting_trainer.viewer.static_files import answer, read_files
 
 SESSION = '/session'

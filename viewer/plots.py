@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.viewer.history import Floats
+from cutting_trainer.viewer.ring_buffers import Floats
 
 BLUE, ORANGE, RED = '#1c7ed6', '#e8590c', '#c2255c'
 

@@ -6,29 +6,30 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.bags.player import Playhead, duration
+from cutting_trainer.bags.playback_control import Playhead
+from cutting_trainer.bags.playback_messages import duration
 from cutting_trainer.bags.reader import Bag
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
+from cutting_trainer.viewer.access_control import Gate
+from cutting_trainer.viewer.allowed_requests import ReplayControls
 from cutting_trainer.viewer.appearance import (
     FLOOR,
     METRES_PER_NEWTON,
-    OTHER_TISSUE,
     TISSUE_SPACING,
     camera,
     shown_tissue,
     tool_shape,
 )
-from cutting_trainer.viewer.controls import ReplayControls
-from cutting_trainer.viewer.gate import Gate
+from cutting_trainer.viewer.bag_timeline import ComputedTissue, RecordedTissue, RecordedTool
+from cutting_trainer.viewer.colours import OTHER_TISSUE
+from cutting_trainer.viewer.drawn_surface import TissueSource
 from cutting_trainer.viewer.live_page import put_moment
-from cutting_trainer.viewer.moment import Floats, Translator
+from cutting_trainer.viewer.page_protocol import VERSION, AnyMessage, Play, Seek, Speed
 from cutting_trainer.viewer.page_server import PageServer
+from cutting_trainer.viewer.pending_requests import Requests
 from cutting_trainer.viewer.plots import BLUE, DEPTH, FORCE, ORANGE, Plot
-from cutting_trainer.viewer.protocol import VERSION, AnyMessage, Play, Seek, Speed
-from cutting_trainer.viewer.surfaces import TissueSource
-from cutting_trainer.viewer.tracks import ComputedTissue, RecordedTissue, RecordedTool
-from cutting_trainer.viewer.waiting import Requests
+from cutting_trainer.viewer.tool_state import Floats, Translator
 
 RATE_HZ = 30.0
 """[Hz] Largest update rate of the page."""

@@ -7,8 +7,8 @@ from typing import Any
 
 from bench.accuracy.measure import EQUAL_ERROR_RATIO, Point, is_beaten
 from bench.accuracy.vibration import Vibration
-from cutting_trainer.session.scene import SCENES, load_scene
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.session.scene_loader import SCENES, load_scene
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 PANELS = {
     'block': ('indentation', 'after_cut'),

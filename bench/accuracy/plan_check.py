@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bench.accuracy.quadratic import QuadraticTissue
 from cutting_trainer.node_common.errors import MeshError
-from cutting_trainer.session.scene import SCENES, Scene, load_scene
+from cutting_trainer.session.scene_loader import SCENES, Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
@@ -26,7 +26,7 @@ from cutting_trainer.tissue_sim.planner.candidate import Candidate, Task
 from cutting_trainer.tissue_sim.planner.frame_cost import frame_time
 from cutting_trainer.tissue_sim.planner.indentation import Indenter, places, settlement
 from cutting_trainer.tissue_sim.planner.plan import plan
-from cutting_trainer.tissue_sim.planner.reasons import percent
+from cutting_trainer.tissue_sim.planner.rejection_reasons import percent
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.warm_up import warm_up
 

@@ -29,17 +29,17 @@ from bench.accuracy.reference import (
     graded,
 )
 from bench.common.meshes import PLANE_TOLERANCE_M, beam, end_load, kuhn_block, on_plane, pressed
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
+from cutting_trainer.tissue_sim.material_presets import PRESETS
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
-from cutting_trainer.tissue_sim.presets import PRESETS
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from bench.cuts.strokes import CELL_M, Floats, Stroke, good_block, strokes
-from cutting_trainer.cutting.checks import cut_faces, pieces
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.cut_invariants import cut_faces, pieces
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material

@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bench.cuts.random_strokes import Scene, play, run
-from cutting_trainer.cutting.method import CASES
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_interface import CASES
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 
 def run_strokes(strokes: int, seed: int, method: str, folder: Path) -> Status:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bench.common.marked_page import page_in, put_table
 from bench.cuts.comparison import METHODS, Cut, Row, distances, mean_edge
 from bench.cuts.strokes import Stroke
-from cutting_trainer.cutting.checks import pieces
+from cutting_trainer.cutting.cut_invariants import pieces
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 

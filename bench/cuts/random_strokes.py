@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.cutting.checks import (
+from cutting_trainer.cutting.combined import FOLDED
+from cutting_trainer.cutting.cut_invariants import (
     ViolationError,
     check_area,
     check_mesh,
     cut_face_area,
     cut_faces,
 )
-from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.cutting.geometry import smallest_altitudes
-from cutting_trainer.cutting.method import SweepError
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_interface import SweepError
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, interpolated
 

@@ -30,11 +30,11 @@ from bench.cuts.curves import (
     scattered,
     slab,
 )
-from cutting_trainer.cutting.checks import ViolationError, check_mesh, cut_faces
 from cutting_trainer.cutting.combined import FOLDED
-from cutting_trainer.cutting.method import FAILURES
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.cut_invariants import ViolationError, check_mesh, cut_faces
+from cutting_trainer.cutting.method_interface import FAILURES
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 

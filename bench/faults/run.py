@@ -12,7 +12,7 @@ from rich.table import Table
 from bench.faults.candidates import Fault, draw
 from bench.faults.copy import Copy, Outcome
 from bench.faults.suspects import likely_tests
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 ROUNDS = ('nearest', 'near', 'usual', 'all')
 """Rounds of tests: the files most likely to find it, the next ones, the rest of `./trainer test`,

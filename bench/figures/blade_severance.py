@@ -7,7 +7,7 @@ from bench.cuts.severance import Severed, cut_mesh
 from bench.cuts.severance import measure as measured
 from bench.cuts.strokes import good_block
 from bench.figures.figure import Figure
-from cutting_trainer.cutting.checks import cut_face_area
+from cutting_trainer.cutting.cut_invariants import cut_face_area
 
 _RATIOS = (2, 3, 4, 6)
 """Radii of circles, in edges."""

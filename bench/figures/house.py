@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from bench.figures.figure import Figure
-from bench.words import ROOT, docstrings, replaced_names, summaries_without_verb, what_clauses
+from bench.terminology import ROOT, docstrings, replaced_names, summaries_without_verb, what_clauses
 
 PRODUCT_BEFORE, REPOSITORY_BEFORE = 48_519, 81_581
 """Lines of Python at commit 257699d, before the modules were moved."""

@@ -8,7 +8,7 @@ import numpy as np
 from bench.accuracy.law_problems import CASES, compared, settled, solved_reference
 from bench.accuracy.law_problems import unstructured_block as block_of
 from bench.common.meshes import kuhn_block
-from bench.cuts.yanks import MAX_AWAY, torture
+from bench.cuts.random_loads import MAX_AWAY, torture
 from bench.figures.figure import Figure
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName, internal_force

@@ -17,10 +17,10 @@ import numpy as np
 
 from bench.figures.figure import Figure
 from bench.flood import OFFERED_WORDS_PER_S, Flood
-from cutting_trainer.haptic_bridge.chain import INSIDE, MAX_SLEW_PERIOD_S, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, MAX_SLEW_PERIOD_S, NONE, TOUCHING
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
-from cutting_trainer.haptic_bridge.settings import (
+from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
@@ -42,9 +42,9 @@ from cutting_trainer.node_common.operating_state import (
     OperatingStateMachine,
     crtk_types,
 )
-from cutting_trainer.node_common.share import PACKAGES
+from cutting_trainer.node_common.share_folder import PACKAGES
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import node_environment
+from cutting_trainer.session.node_commands import node_environment
 
 SEQUENCES, LENGTH = 3000, 40
 """Random sequences of commands, faults, restarts, E-STOPs and resets, and their steps."""

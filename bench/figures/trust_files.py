@@ -9,8 +9,13 @@ from bench.files.commands import READING, run
 from bench.files.damaged_bags import KINDS, damage, outcome, small_bag
 from bench.files.hostile_bags import HOSTILE_BAGS
 from bench.files.hostile_files import HOSTILE_YAML
-from cutting_trainer.cli import bags as commands_bags
-from cutting_trainer.recordings import html_report, picture, repair, resimulate
+from cutting_trainer.cli import bag_commands
+from cutting_trainer.recordings import (
+    html_report,
+    picture,
+    repair_command,
+    resimulate_command,
+)
 
 SAMPLE = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_4' / 'palpation'
 TOPICS = ('/tissue/mesh', '/tissue/force', '/tool/contact')
@@ -23,7 +28,7 @@ BAGS = (
 SCENES = ('aliases', 'lists 900 deep', 'blocks 900 deep', 'ten megabytes')
 MAX_MEMORY_MB = 500.0
 """Memory limit for a hostile file."""
-LOADED = (commands_bags, html_report, picture, repair, resimulate)
+LOADED = (bag_commands, html_report, picture, repair_command, resimulate_command)
 """Imported here, so that they do not count as memory of a file."""
 
 

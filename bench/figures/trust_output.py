@@ -20,10 +20,10 @@ from rclpy.executors import SingleThreadedExecutor
 from bench.figures.figure import Figure
 from cutting_trainer.node_common.operating_state import E_STOP, CrtkState, crtk_types
 from cutting_trainer.node_common.qos import EVENTS
-from cutting_trainer.node_common.share import share_folder
+from cutting_trainer.node_common.share_folder import share_folder
 from cutting_trainer.node_common.timing import MAX_TIMELY_LATENESS_S
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import ARM_NODE, BRIDGE_NODE, MODULES, node_environment
+from cutting_trainer.session.node_commands import ARM_NODE, BRIDGE_NODE, MODULES, node_environment
 
 PIPE_BYTES = 4096
 """Smallest size of a pipe: full after a second."""

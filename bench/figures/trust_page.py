@@ -3,7 +3,7 @@
 import statistics
 
 from bench.figures.figure import Figure
-from bench.page.fuzz import Flood, stop_delays, trial
+from bench.page.fuzz_socket import Flood, stop_delays, trial
 from bench.page.open_page import OpenPage
 from bench.page.stand_in import OtherProcess
 

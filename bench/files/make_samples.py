@@ -17,11 +17,11 @@ from pathlib import Path
 from cutting_trainer.bags.metadata import FORMAT_VERSION
 from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.repair import copy_bag
-from cutting_trainer.bags.topics import CONTACT, MESH
+from cutting_trainer.bags.topic_names import CONTACT, MESH
 from cutting_trainer.recordings.picture import make_picture
-from cutting_trainer.recordings.resimulate import resimulate
+from cutting_trainer.recordings.resimulate_command import resimulate
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / 'bags' / 'samples'

@@ -33,7 +33,7 @@ from cutting_trainer.node_common.realtime import prepare
 from cutting_trainer.node_common.ros import MESH_UPDATES, polled, take_raw
 from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import node_environment, recorder_command
+from cutting_trainer.session.node_commands import node_environment, recorder_command
 from cutting_trainer.tissue_sim.streaming.messages import packed
 
 NODES = 4500

@@ -19,7 +19,7 @@ from bench.graph.impaired_link import Impairment, TwoHosts, missing_rights
 from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 
 ROOT = Path(__file__).parents[2]
 READY_TIMEOUT_S = 60.0

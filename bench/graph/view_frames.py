@@ -34,11 +34,11 @@ from cutting_trainer.node_common.qos import LATCHED, UPDATES
 from cutting_trainer.node_common.ros import FRAME, MESH, MESH_UPDATES
 from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import LOCAL, node_environment, viewer_command
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.node_commands import LOCAL, node_environment, viewer_command
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.session.supervisor import Supervisor
 from cutting_trainer.tissue_sim.streaming.messages import packed
-from cutting_trainer.viewer.gate import TOKEN_VARIABLE
+from cutting_trainer.viewer.access_control import TOKEN_VARIABLE
 
 RATE_HZ = 30.0
 CONDITIONS = {'1 page': (1, 0), '3 pages': (3, 0), '2, one never reads': (1, 1)}

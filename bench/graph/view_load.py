@@ -22,12 +22,12 @@ from rich.table import Table
 
 from bench.page.open_page import OtherProcess
 from bench.trials.operator import Operator
-from cutting_trainer.bags.player import first_time
+from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.topics import UPDATES
+from cutting_trainer.bags.topic_names import UPDATES
+from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.evidence import read_evidence
-from cutting_trainer.session.graph import (
+from cutting_trainer.session.node_commands import (
     BRIDGE_NODE,
     LOCAL,
     TISSUE_NODE,
@@ -38,9 +38,9 @@ from cutting_trainer.session.graph import (
     viewer_command,
 )
 from cutting_trainer.session.progress import SessionProgress
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.session.supervisor import Supervisor
-from cutting_trainer.viewer.gate import TOKEN_VARIABLE, link
+from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, link
 
 CONDITIONS = {'no view': None, 'view, 0 pages': 0, 'view, 3 pages': 3}
 PORT, TOKEN = 8899, 'of-this-measurement'

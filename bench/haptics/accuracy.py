@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.speed.tissue import TOUGHNESS
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.haptic_bridge.proxy.undented_surface import UndentedSurface
-from cutting_trainer.haptic_bridge.settings import HapticsSettings
+from cutting_trainer.haptic_bridge.scene_schema import HapticsSettings
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.in_process import TICK_S, InProcess, LinkSettings, Tissue
-from cutting_trainer.session.scene import Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import load_tissue
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact

@@ -6,7 +6,7 @@ They show the known defects (docs/haptics.md).
 import numpy as np
 from numba import njit
 
-from cutting_trainer.haptic_bridge.proxy.inside import MAX_FAN, is_inside
+from cutting_trainer.haptic_bridge.proxy.inside_test import MAX_FAN, is_inside
 from cutting_trainer.haptic_bridge.proxy.kernels import STATE
 from cutting_trainer.haptic_bridge.proxy.neighbourhood import CAPACITY, gather, refresh
 from cutting_trainer.haptic_bridge.proxy.proxy import Proxy, Touch

@@ -6,7 +6,7 @@ import numpy as np
 
 from bench.haptics.accuracy import APPROACH_TIME_S, PLACES, Bench, Floats, Motion, wave
 from cutting_trainer.session.in_process import TICK_S, LinkSettings
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,15 @@ from bench.common.marked_page import page_in, put_table
 from bench.haptics.accuracy import MOTIONS, Row, compare, missed_bounds
 from bench.haptics.energy import energies, energies_table
 from bench.haptics.pictures import draw_energies, draw_stability
-from bench.haptics.stability import LAWS, Cell, Outcome, counts, default_failures, places, run_place
+from bench.haptics.stability_map import (
+    LAWS,
+    Cell,
+    Outcome,
+    counts,
+    default_failures,
+    places,
+    run_place,
+)
 
 
 def run_accuracy(folder: Path, *, as_json: bool = False) -> list[str]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from bench.haptics.energy import Energy
-from bench.haptics.stability import (
+from bench.haptics.stability_map import (
     DELAYS,
     HAND_STIFFNESSES,
     LOSSES,

@@ -24,7 +24,7 @@ from matplotlib import image
 from websockets.sync.client import connect
 
 from bench.common.waiting import until
-from cutting_trainer.session import child
+from cutting_trainer.session import parent_death_signal
 
 STEP_TIMEOUT_S = 150.0
 """Timeout of any step on a shared machine without a graphics card."""
@@ -212,7 +212,7 @@ def chromium(size: tuple[int, int], coarseness: int = 1) -> Iterator[Browser]:
     assert CHROMIUM is not None
     with tempfile.TemporaryDirectory(prefix='chromium-', ignore_cleanup_errors=True) as profile:
         # Bound to this process: the kernel ends both together.
-        command = [sys.executable, '-I', '-S', child.__file__, str(os.getpid()), '9']
+        command = [sys.executable, '-I', '-S', parent_death_signal.__file__, str(os.getpid()), '9']
         command += [CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
         command += [f'--user-data-dir={profile}', '--no-first-run', '--disable-extensions']
         command += ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--mute-audio']

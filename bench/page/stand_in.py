@@ -18,10 +18,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from cutting_trainer.viewer.controls import Bounds, LiveControls
-from cutting_trainer.viewer.gate import PageLimits, link, make_gate
+from cutting_trainer.viewer.access_control import PageLimits, link, make_gate
+from cutting_trainer.viewer.allowed_requests import Bounds, LiveControls
+from cutting_trainer.viewer.page_protocol import AnyMessage, EStop
 from cutting_trainer.viewer.page_server import PageServer
-from cutting_trainer.viewer.protocol import AnyMessage, EStop
 
 TOKEN = 'of-this-test'
 GATE = make_gate('127.0.0.1', [], TOKEN)

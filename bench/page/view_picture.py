@@ -9,11 +9,11 @@ from pathlib import Path
 from threading import Thread
 
 from bench.page.browser import chromium
-from cutting_trainer.bags.player import duration
+from cutting_trainer.bags.playback_messages import duration
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.session.graph import LOCAL
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.viewer.gate import link, make_gate
+from cutting_trainer.session.node_commands import LOCAL
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.viewer.access_control import link, make_gate
 from cutting_trainer.viewer.replay_page import ReplayPage
 
 

@@ -3,9 +3,9 @@
 Run as `python -m bench.reference.materials` in the checkout after a change of the presets.
 """
 
-from cutting_trainer.node_common.share import PACKAGES
-from cutting_trainer.tissue_sim.presets import PRESETS
-from cutting_trainer.tissue_sim.settings import MaterialSettings
+from cutting_trainer.node_common.share_folder import PACKAGES
+from cutting_trainer.tissue_sim.material_presets import PRESETS
+from cutting_trainer.tissue_sim.scene_schema import MaterialSettings
 
 FILE = PACKAGES / 'docs' / 'materials.md'
 _PAGE = """# Materials

@@ -13,13 +13,13 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from cutting_trainer.cutting.settings import CuttingSettings
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
-from cutting_trainer.node_common.scene_file import SECTIONS
-from cutting_trainer.node_common.share import PACKAGES
-from cutting_trainer.session.scene import SessionSettings
-from cutting_trainer.tissue_sim.settings import TissueSettings
+from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.node_common.scene_reader import SECTIONS
+from cutting_trainer.node_common.share_folder import PACKAGES
+from cutting_trainer.session.scene_loader import SessionSettings
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MODELS: dict[str, type[BaseModel]] = {
     'tissue': TissueSettings,

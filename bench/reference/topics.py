@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from cutting_trainer.node_common import qos, ros
-from cutting_trainer.node_common.share import PACKAGES
+from cutting_trainer.node_common.share_folder import PACKAGES
 
 FILE = PACKAGES / 'docs' / 'topics.md'
 MARK = '<!-- Below: written by `python -m bench.reference.topics` from the interfaces. -->\n'

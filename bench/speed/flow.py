@@ -6,12 +6,12 @@ import numpy as np
 
 from bench.common.clock import Figure, by_turns, figure, stream
 from bench.speed.tissue import BOX_SIZE_M, TOUGHNESS, box, liver_material
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.haptic_bridge.force_path import ForcePath
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.session.in_process import TICK_S, InProcess, Tissue
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica, state_hash
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, Touched

@@ -20,12 +20,12 @@ from bench.speed.tissue import (
     edge_of,
     liver_material,
 )
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.mesh_import.imported_scene import DAMPING_PER_EDGE
 from cutting_trainer.session.in_process import answer
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact, indenter_contact
 from cutting_trainer.tissue_sim.elasticity.material import Material

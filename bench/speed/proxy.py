@@ -11,10 +11,10 @@ import time
 import numpy as np
 
 from bench.common.clock import Figure, figure
-from cutting_trainer.haptic_bridge import chain, extrapolation
+from cutting_trainer.haptic_bridge import extrapolation, force_kernels
 from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
-from cutting_trainer.haptic_bridge.settings import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 
 POINTS = 101
 _TICKS_A_FRAME = 33
@@ -36,8 +36,8 @@ def hills(phase: float) -> tuple[np.ndarray, np.ndarray]:
 def measure(ticks: int, moving: bool) -> np.ndarray:
     """Return the time of the proxy's step and of the force law [us], shape (ticks, 2)."""
     tool, device, haptics = ToolSettings(), DeviceSettings(), HapticsSettings()
-    setup = chain.make_setup(tool, device, haptics, device.load_profile())
-    state, history = np.zeros(1, chain.STATE), np.zeros(1, extrapolation.HISTORY)
+    setup = force_kernels.make_setup(tool, device, haptics, device.load_profile())
+    state, history = np.zeros(1, force_kernels.STATE), np.zeros(1, extrapolation.HISTORY)
     force, where = np.array([0.0, 0.0, 0.3]), np.zeros(3)
     stiffness, depth = np.diag([0.0, 0.0, 80.0]), np.array([0.0, 0.0, 4e-3])
     extrapolation.push(history, 1, where, force, stiffness, depth, topology=0, state=1)
@@ -55,8 +55,8 @@ def measure(ticks: int, moving: bool) -> np.ndarray:
         touch = proxy.step(surface, blend, pose[:3])
         middle = time.thread_time()
         state['proxy'], state['normal'] = touch.position, touch.normal
-        chain.to_tissue(setup, state, pose)
-        chain.command(setup, state, history, chain.TOUCHING, True, i, 1.0, 1e-3)
+        force_kernels.to_tissue(setup, state, pose)
+        force_kernels.command(setup, state, history, force_kernels.TOUCHING, True, i, 1.0, 1e-3)
         spent[i] = middle - start, time.thread_time() - middle
     return 1e6 * spent
 

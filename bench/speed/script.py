@@ -14,13 +14,13 @@ import numpy as np
 from rich.console import Console
 
 from bench.speed.frame import FRAME_PERIOD_MS
-from cutting_trainer.cutting.methods import make_method
+from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
-from cutting_trainer.recordings.incision import planned_paths
-from cutting_trainer.session.changed_scene import parse_changes, write_changed
+from cutting_trainer.recordings.incision_metrics import planned_paths
 from cutting_trainer.session.in_process import InProcess, Tissue, make_force_path
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.scene_overrides import parse_changes, write_changed
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutOutcome, Frame, ToolContact
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.common.clock import Figure, figure
-from cutting_trainer.node_common.share import share_folder
+from cutting_trainer.node_common.share_folder import share_folder
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.graph import (
+from cutting_trainer.session.node_commands import (
     MODULES,
     RECORDER_NODE,
     node_command,

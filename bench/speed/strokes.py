@@ -19,16 +19,16 @@ from rich.console import Console
 
 from bench.speed.strokes_report import MAX_RATIO, Row, picture, ratios, table
 from bench.speed.tissue import BOX_SIZE_M, TOUGHNESS, box, liver_material
-from cutting_trainer.cutting.checks import ViolationError, check_mesh, cut_faces, pieces
 from cutting_trainer.cutting.combined import FOLDED
-from cutting_trainer.cutting.method import CutResult
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.cut_invariants import ViolationError, check_mesh, cut_faces, pieces
+from cutting_trainer.cutting.method_interface import CutResult
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.in_process import Tissue
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact, indenter_contact
 from cutting_trainer.tissue_sim.elasticity.models import ModelName

@@ -20,13 +20,18 @@ from rich.table import Table
 
 from cutting_trainer.node_common.realtime import PRIORITY
 from cutting_trainer.node_common.timing import MAX_TIMELY_LATENESS_S
+from cutting_trainer.session.bag_measurements import Status as NodeStatus
+from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.evidence import Status as NodeStatus
-from cutting_trainer.session.evidence import read_evidence
-from cutting_trainer.session.graph import ARM_NODE, BRIDGE_NODE, node_environment, session_nodes
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import (
+    ARM_NODE,
+    BRIDGE_NODE,
+    node_environment,
+    session_nodes,
+)
 from cutting_trainer.session.progress import SessionProgress
-from cutting_trainer.session.scene import load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.session.supervisor import Supervisor
 from cutting_trainer.session.terminal import session_console
 

@@ -9,7 +9,7 @@ from numba import njit
 
 from bench.common.clock import Figure, by_turns, figure, stream
 from bench.common.meshes import PLANE_TOLERANCE_M, kuhn_block
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact

@@ -28,11 +28,11 @@ from bench.trials.trial import (
 )
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.session.demo import new_bag
-from cutting_trainer.session.graph import RECORDER_NODE
+from cutting_trainer.session.demo_command import new_bag
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import RECORDER_NODE
 from cutting_trainer.session.outcome import Outcome
-from cutting_trainer.session.scene import Scene, load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.scene_loader import Scene, load_scene
 
 QUIET_TIME_S = 12.0
 """Time without faults before the first one and after the last [s]."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.settings import DeviceProfile
+from cutting_trainer.haptic_bridge.scene_schema import DeviceProfile
 
 FaultKind = Literal['kill', 'freeze', 'end']
 ARM_WATCHDOG_TIMEOUT_S = 0.03

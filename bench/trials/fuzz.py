@@ -15,13 +15,18 @@ from bench.trials.fuzz_verdict import busiest_second, problems
 from bench.trials.fuzz_watch import NodeObserver
 from bench.trials.operator import Operator
 from bench.trials.trial import Course, Running, TrialOptions, print_result, run_trial
-from cutting_trainer.session.changed_scene import write_changed
-from cutting_trainer.session.demo import new_bag
-from cutting_trainer.session.graph import LOCAL, recorder_command, simulation_nodes, viewer_command
+from cutting_trainer.session.demo_command import new_bag
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import (
+    LOCAL,
+    recorder_command,
+    simulation_nodes,
+    viewer_command,
+)
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.outcome import Outcome
-from cutting_trainer.session.scene import Scene, load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.session.scene_overrides import write_changed
 
 NODE, OPERATOR = 'fuzz', 'operator'
 TOUCH_TIMEOUT_S = 60.0

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from bench.trials.fuzz_messages import KINDS, Kind, Maker, huge
 from cutting_trainer.bags.message_class import message_class
 from cutting_trainer.node_common import qos, ros
-from cutting_trainer.session.graph import RECORDER_NODE
+from cutting_trainer.session.node_commands import RECORDER_NODE
 
 BURST_MESSAGES = 100
 """Number of messages between two pauses."""

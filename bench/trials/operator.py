@@ -19,8 +19,8 @@ from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
 from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
 from cutting_trainer.node_common.orientation import quaternion
-from cutting_trainer.session.graph import BRIDGE_NODE
-from cutting_trainer.session.scene import Scene
+from cutting_trainer.session.node_commands import BRIDGE_NODE
+from cutting_trainer.session.scene_loader import Scene
 
 POLL_PERIOD_S = 0.002
 GOAL_PERIOD_S = 1 / 60

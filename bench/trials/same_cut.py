@@ -14,7 +14,7 @@ from bench.trials.trial import print_result
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.recordings.html_report import incision_area
 from cutting_trainer.recordings.picture import read_story
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.exit_status import Status
 from cutting_trainer.tissue_sim.mesh.pieces import pieces_of
 
 MAX_SPREAD = 0.01

@@ -24,10 +24,10 @@ from bench.trials.trial import (
     recorded_nodes,
     run_trial,
 )
-from cutting_trainer.session.graph import CUTTING_NODE, RECORDER_NODE, TISSUE_NODE
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import CUTTING_NODE, RECORDER_NODE, TISSUE_NODE
 from cutting_trainer.session.outcome import Outcome
-from cutting_trainer.session.scene import Scene, load_scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.scene_loader import Scene, load_scene
 
 RESTARTED_NODES = (RECORDER_NODE, TISSUE_NODE, CUTTING_NODE)
 """Nodes that restart with each session; the others, and all processes, go on."""

@@ -10,14 +10,18 @@ from typing import Any, Literal, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from cutting_trainer.session.demo import report_failed_start
+from cutting_trainer.session.demo_command import report_failed_start
 from cutting_trainer.session.domain import reserved_domain
-from cutting_trainer.session.graph import node_environment, recorder_command, simulation_nodes
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import (
+    node_environment,
+    recorder_command,
+    simulation_nodes,
+)
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.progress import SessionProgress
-from cutting_trainer.session.scene import Scene
-from cutting_trainer.session.status import Status
+from cutting_trainer.session.scene_loader import Scene
 from cutting_trainer.session.supervisor import Event, Supervisor
 from cutting_trainer.session.terminal import session_console
 

@@ -12,8 +12,8 @@ import numpy as np
 from bench.cuts.strokes import good_block
 from bench.speed.strokes import blade_contact
 from bench.validate.case import Result
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.in_process import answer
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import ContactState

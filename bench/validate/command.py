@@ -11,7 +11,7 @@ from bench.accuracy.chart import machine
 from bench.validate.case import Case, Result
 from bench.validate.cases import CASES, NOT_REPRODUCED
 from bench.validate.picture import draw
-from cutting_trainer.cutting.settings import CuttingSettings
+from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.warm_up import warm_up

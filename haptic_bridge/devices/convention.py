@@ -3,7 +3,7 @@
 All other code uses metres, right-handed frames, and the force on the hand.
 """
 
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 
 _METRES = {'m': 1.0, 'dm': 0.1, 'cm': 0.01, 'mm': 0.001}

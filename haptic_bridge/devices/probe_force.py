@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.devices.probe import PUSH_FORCE_N, ProbeCheck
+from cutting_trainer.haptic_bridge.devices.probe_stream import PUSH_FORCE_N, ProbeCheck
 
 MIN_DEFLECTION_M = 2e-4
 """[m] Deflection of a hand that holds the arm loosely under `PUSH_FORCE_N`."""

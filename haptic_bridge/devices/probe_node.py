@@ -11,18 +11,18 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from cutting_trainer.haptic_bridge.devices.probe import (
+from cutting_trainer.haptic_bridge.devices.probe_force import (
+    MAX_UNCERTAINTY_DEG,
+    direction_uncertainty,
+)
+from cutting_trainer.haptic_bridge.devices.probe_pose import find_rotation
+from cutting_trainer.haptic_bridge.devices.probe_stream import (
     MAX_GAP_S,
     PUSH_FORCE_N,
     Poses,
     ProbeCheck,
     find_move,
 )
-from cutting_trainer.haptic_bridge.devices.probe_force import (
-    MAX_UNCERTAINTY_DEG,
-    direction_uncertainty,
-)
-from cutting_trainer.haptic_bridge.devices.probe_pose import find_rotation
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
 from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.node_common.orientation import from_quaternion

@@ -9,7 +9,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.devices.probe import ProbeCheck
+from cutting_trainer.haptic_bridge.devices.probe_stream import ProbeCheck
 from cutting_trainer.node_common.orientation import from_quaternion
 
 RULER_LENGTH_M = 0.1

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.node_common.rejections import MessageError, RejectionStatistics
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.emulated_arm.settings import (
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import (
     HandSettings,
     Phase,
     PoseSettings,
     ScriptSettings,
 )
-from cutting_trainer.haptic_bridge.settings import SettingsError, Transform
+from cutting_trainer.haptic_bridge.scene_schema import SettingsError, Transform
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.node_common.orientation import quaternion
 

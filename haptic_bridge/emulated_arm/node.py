@@ -15,8 +15,8 @@ from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
 from cutting_trainer.haptic_bridge.emulated_arm.faults import DriverFaults
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
-from cutting_trainer.haptic_bridge.emulated_arm.settings import ArmSettings
-from cutting_trainer.haptic_bridge.settings import DeviceSettings
+from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import (
     PoseStampedCodec,
     TwistStampedCodec,
@@ -42,7 +42,7 @@ from cutting_trainer.node_common.ros import (
     stamp,
     take_numbered,
 )
-from cutting_trainer.node_common.scene_file import read_section
+from cutting_trainer.node_common.scene_reader import read_section
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
 

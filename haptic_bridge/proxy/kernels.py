@@ -4,7 +4,7 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge.proxy import half_spaces
 from cutting_trainer.haptic_bridge.proxy.half_spaces import SPACES
-from cutting_trainer.haptic_bridge.proxy.inside import MAX_FAN, TIE_TOLERANCE_M, is_inside
+from cutting_trainer.haptic_bridge.proxy.inside_test import MAX_FAN, TIE_TOLERANCE_M, is_inside
 from cutting_trainer.haptic_bridge.proxy.neighbourhood import (
     CAPACITY,
     NEAR,

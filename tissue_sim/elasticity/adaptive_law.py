@@ -15,7 +15,17 @@ import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.elasticity.corotational import KEPT
-from cutting_trainer.tissue_sim.elasticity.law_chunks import (
+from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import (
+    add_domain_forces,
+    smoothed_gradient,
+)
+from cutting_trainer.tissue_sim.elasticity.rotation import LANES
+from cutting_trainer.tissue_sim.elasticity.simd import three
+from cutting_trainer.tissue_sim.elasticity.stiffening import (
+    linear_stress,
+    tangent_bound,
+)
+from cutting_trainer.tissue_sim.elasticity.stiffening_simd import (
     GROUP,
     MAX_STRETCH,
     MIN_STRETCH,
@@ -29,16 +39,6 @@ from cutting_trainer.tissue_sim.elasticity.law_chunks import (
     groups_beyond,
     law_in_lanes,
     tangents_in_lanes,
-)
-from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import (
-    add_domain_forces,
-    smoothed_gradient,
-)
-from cutting_trainer.tissue_sim.elasticity.rotation import LANES
-from cutting_trainer.tissue_sim.elasticity.simd import three
-from cutting_trainer.tissue_sim.elasticity.stiffening import (
-    linear_stress,
-    tangent_bound,
 )
 
 _EVERY = 4

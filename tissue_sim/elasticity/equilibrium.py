@@ -8,8 +8,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from cutting_trainer.node_common.errors import MeshError
-from cutting_trainer.tissue_sim.elasticity.law_equilibrium import LawEquilibrium
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.elasticity.stiffening_equilibrium import LawEquilibrium
 
 Floats = NDArray[np.float64]
 

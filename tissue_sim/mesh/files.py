@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cutting_trainer.node_common.errors import MeshError
-from cutting_trainer.node_common.scene_file import missing_file
+from cutting_trainer.node_common.scene_reader import missing_file
 
 _log = logging.getLogger(__name__)
 

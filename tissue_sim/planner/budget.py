@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from cutting_trainer.node_common.scene_file import SceneModel
+from cutting_trainer.node_common.scene_reader import SceneModel
 
 
 class Budget(SceneModel):

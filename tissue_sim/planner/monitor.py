@@ -2,7 +2,7 @@
 
 from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.planner.plan import Plan
-from cutting_trainer.tissue_sim.planner.reasons import ms, percent
+from cutting_trainer.tissue_sim.planner.rejection_reasons import ms, percent
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 

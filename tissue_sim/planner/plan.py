@@ -18,7 +18,7 @@ from cutting_trainer.tissue_sim.planner.method_errors import (
     model_errors,
     time_error,
 )
-from cutting_trainer.tissue_sim.planner.reasons import (
+from cutting_trainer.tissue_sim.planner.rejection_reasons import (
     Rejection,
     dearer,
     inaccurate,

@@ -44,7 +44,7 @@ from cutting_trainer.tissue_sim.motion import (
 from cutting_trainer.tissue_sim.motion import divergence as guard
 from cutting_trainer.tissue_sim.simulation import local_stiffness as contact_stiffness
 from cutting_trainer.tissue_sim.simulation import simulation
-from cutting_trainer.tissue_sim.simulation.object_state import (
+from cutting_trainer.tissue_sim.simulation.serialisation import (
     ObjectState,
     capture,
     classes_of,

@@ -20,7 +20,7 @@ from cutting_trainer.tissue_sim.elasticity.rotation import LANES
 from cutting_trainer.tissue_sim.elasticity.viscosity import KEPT as KEPT_OF_TERM
 from cutting_trainer.tissue_sim.elasticity.viscosity import ViscousNodes
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.simulation.object_state import StateError
+from cutting_trainer.tissue_sim.simulation.serialisation import StateError
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 

@@ -9,7 +9,7 @@ from cutting_trainer_msgs.msg import State
 from rclpy.publisher import Publisher
 
 from cutting_trainer.node_common import ros
-from cutting_trainer.tissue_sim.simulation.object_state import ObjectState
+from cutting_trainer.tissue_sim.simulation.serialisation import ObjectState
 from cutting_trainer.tissue_sim.streaming.messages import packed
 
 _SUBSCRIPTION_DELAY_S = 0.5

@@ -1,0 +1,244 @@
+"""Recorded inputs and results of each simulation frame."""
+
+import contextlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.message_order import Sequence
+from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.recorded_tissue import first_current_keyframe
+from cutting_trainer.bags.topic_names import CONTACT, FORCE, INPUTS, MESH, POSE, of_session
+from cutting_trainer.node_common.cdr_codec import (
+    ContactCodec,
+    ForceSampleCodec,
+    PoseStampedCodec,
+    StampedMessage,
+)
+from cutting_trainer.node_common.rejections import MessageError
+from cutting_trainer.node_common.stamps import nanoseconds
+from cutting_trainer.tissue_sim.contact.tool import CutOutcome
+
+_TRAILING_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """Recorded inputs and results of one frame.
+
+    Attributes:
+        step: number of the frame.
+        time: when it ended [ns since the epoch].
+        has_contact: whether a contact loaded the tissue.
+        contact: its message, None where the bag lacks it.
+        pose: the device pose of that contact, None where the bag lacks it.
+        answer: result of the last requested cut (`CutOutcome`).
+        cut_step: frame that requested it; 0 without an answer.
+        answer_frames: number of frames from the request of a cut to that which applies its
+            answer. 0: it was applied on arrival, in bags before format 3.
+        diverged: the frame was taken back.
+        force: `ForceSample` of the frame, None where the bag lacks it.
+    """
+
+    step: int
+    time: int
+    has_contact: bool
+    contact: Any
+    pose: StampedMessage | None
+    answer: int
+    cut_step: int
+    answer_frames: int
+    diverged: bool
+    force: StampedMessage | None
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Frames that one process has computed.
+
+    Attributes:
+        run: number of processes that had computed frames before.
+        first, last: numbers of its frames.
+        since, until: log times [ns since the epoch] of its messages; messages between the frames of
+            two processes are in the segments of both.
+    """
+
+    run: int
+    first: int
+    last: int
+    since: int = 0
+    until: int = 1 << 63
+
+
+@dataclass(frozen=True)
+class Restart:
+    """Continuation of the simulation by another process.
+
+    Attributes:
+        step: its first frame.
+        seconds: its time since the first frame of all [s].
+    """
+
+    step: int
+    seconds: float
+
+
+def runs(bag: Bag, messages: Iterable[Recorded]) -> Iterator[tuple[int, Recorded, Any]]:
+    """Yield the messages of a topic of `tissue_sim` with the number of restarts before each.
+
+    A new process numbers its messages anew. It goes on with the frames from the last known tissue,
+    from an existing frame or from the next.
+
+    Args:
+        bag: that has them.
+        messages: of one topic, in their order.
+
+    Yields:
+        Number of restarts, the message as recorded, and the decoded message.
+    """
+    run = number = step = -1
+    for recorded in messages:
+        message = bag.read(recorded)
+        again = recorded.topic == INPUTS and message.step == step
+        if message.step < step or again or 0 < recorded.sequence <= number or run < 0:
+            run += 1
+        number, step = recorded.sequence, message.step
+        yield run, recorded, message
+
+
+def segments(bag: Bag) -> list[Segment]:
+    """Return the frames of a bag by the process that computed them, in their order.
+
+    Raises:
+        BagError: the bag does not record the inputs of its frames.
+    """
+    found: list[Segment] = []
+    ended = 0
+    for run, recorded, message in _inputs(bag):
+        now = recorded.log_time
+        if run == len(found):
+            # The other messages of the process before follow its last frame by a moment.
+            since = ended + min(_TRAILING_NS, (now - ended) // 2) if found else 0
+            found = [*found[:-1], *(replace(segment, until=now) for segment in found[-1:])]
+            found.append(Segment(run, message.step, message.step, since))
+        found[-1] = replace(found[-1], last=message.step)
+        ended = now
+    if not found:
+        raise BagError(f'{bag.path} has no message of {INPUTS}: it has no frame')
+    return found
+
+
+def _inputs(bag: Bag) -> Iterator[tuple[int, Recorded, Any]]:
+    if INPUTS not in bag.topics():
+        raise BagError(f'{bag.path} has no topic {INPUTS}: it is older than format version 2')
+    return runs(bag, Sequence(bag, INPUTS))
+
+
+def last_cut(bag: Bag, number: int) -> int:
+    """Return the last frame of a process that received a cut by the service; 0: there is none.
+
+    Args:
+        bag: to read.
+        number: number of processes that had computed frames before.
+    """
+    made = (CutOutcome.APPLIED, CutOutcome.EMPTY)
+    return max(
+        (m.step for run, _, m in _inputs(bag) if run == number and m.answer in made), default=0
+    )
+
+
+def read_frames(bag: Bag) -> list[FrameRecord]:
+    """Return the frames of a bag in their order, up to a restart of the simulation.
+
+    Raises:
+        BagError: the bag does not record the inputs of its frames.
+    """
+    return read_run(bag)[0]
+
+
+def read_run(bag: Bag, number: int = 0) -> tuple[list[FrameRecord], Restart | None]:
+    """Return the frames of one process, and the restart after it; None: there is none.
+
+    Args:
+        bag: to read.
+        number: number of processes that had computed frames before.
+
+    Raises:
+        BagError: the bag does not record the inputs of its frames.
+    """
+    inputs: list[Any] = []
+    restart = None
+    for run, _, m in _inputs(bag):
+        if run > number:
+            late = nanoseconds(m.header.stamp) - nanoseconds(inputs[0].header.stamp)
+            restart = Restart(m.step, late * 1e-9)
+            break
+        if run == number:
+            inputs.append(m)
+    used = {(m.contact_sequence, nanoseconds(m.contact_stamp)) for m in inputs if m.has_contact}
+    contacts = _samples(bag, CONTACT, ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used)
+    pose, wanted = of_session(POSE, bag.topics()), {stamp for _, stamp in used}
+    poses = _samples(bag, pose, PoseStampedCodec(), lambda s: s.stamp_ns, wanted)
+    stamps = {nanoseconds(m.header.stamp) for m in inputs}
+    forces = _samples(bag, FORCE, ForceSampleCodec(), lambda s: s.stamp_ns, stamps)
+    records = []
+    for m in inputs:
+        time, stamp = nanoseconds(m.header.stamp), nanoseconds(m.contact_stamp)
+        contact = contacts.get((m.contact_sequence, stamp)) if m.has_contact else None
+        records.append(
+            FrameRecord(
+                step=m.step,
+                time=time,
+                has_contact=m.has_contact,
+                contact=None if contact is None else contact_message(contact),
+                pose=poses.get(stamp) if m.has_contact else None,
+                answer=m.answer,
+                cut_step=m.cut_step,
+                answer_frames=getattr(m, 'answer_frames', 0),
+                diverged=m.diverged,
+                force=forces.get(time),
+            )
+        )
+    return records, restart
+
+
+def contact_message(sample: StampedMessage) -> Any:
+    """Return a `Contact` message from the values of its codec."""
+    values = {}
+    for name, code, count in ContactCodec.layout:
+        got = sample.values[ContactCodec.fields[name]]
+        array = np.array(got, {'d': np.float64, 'I': np.uint32}.get(code))
+        values[name] = got[0] if count == 1 else array
+    return SimpleNamespace(**values)
+
+
+def _samples(
+    bag: Bag, topic: str, codec: Any, key: Any, wanted: set[Any]
+) -> dict[Any, StampedMessage]:
+    found = {}
+    for recorded in bag.messages([topic]):
+        with contextlib.suppress(MessageError):  # no node has used such a message
+            sample = codec.decode(recorded.data)
+            if key(sample) in wanted:
+                found[key(sample)] = sample
+    return found
+
+
+def first_keyframe(bag: Bag) -> Any:
+    """Return the first `Mesh` message of a bag: the tissue before the first frame, if recorded.
+
+    Raises:
+        BagError: it has none.
+    """
+    for recorded in bag.messages([MESH]):
+        mesh = bag.read(recorded)
+        if mesh.step == 0:
+            return mesh
+    current = first_current_keyframe(bag)
+    if current is None:
+        raise BagError(f'{bag.path} has no message of {MESH}: there is no tissue to compute')
+    return bag.read(current)

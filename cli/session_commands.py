@@ -1,0 +1,154 @@
+"""Commands on a running graph: a session, the page, the recorder, a device."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from cutting_trainer.cli.bag_errors import reading
+from cutting_trainer.cli.options import EXIT_STATUSES, AsJson, Changes, Domain, SceneOption, Seed
+from cutting_trainer.session.errors import SessionError
+
+commands = typer.Typer()
+
+
+@commands.command(epilog=EXIT_STATUSES)
+def demo(
+    scene: SceneOption = 'liver',
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            help="Duration [s]; the arm's script is stretched to it (default: of the scene).",
+        ),
+    ] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(help='New folder for the bag (default: bags/sessions/SCENE-TIME).'),
+    ] = None,
+    seed: Seed = 0,
+    domain: Domain = '',
+    as_json: AsJson = False,
+    view: Annotated[
+        bool, typer.Option('--view', help='Serve a page that shows the session (see view).')
+    ] = False,
+) -> None:
+    """Run a session: an emulated arm palpates and cuts the tissue, all of it recorded."""
+    from cutting_trainer.session.demo_command import DemoOptions, run_demo
+    from cutting_trainer.session.domain import parse_domain
+
+    options = DemoOptions(scene, seconds, bag, seed, parse_domain(domain), as_json, view)
+    raise typer.Exit(int(run_demo(options)))
+
+
+@commands.command(epilog=EXIT_STATUSES)
+def view(
+    scene: SceneOption = 'liver',
+    host: Annotated[
+        str,
+        typer.Option(help='Address to serve the page on; 0.0.0.0: open to other machines.'),
+    ] = '127.0.0.1',
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help='Port of the page; 0: one that is free.')
+    ] = 8080,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            '--allow-host',
+            help='Name or address by which pages ask for this machine; may be given again. Needed '
+            'where --host lets other machines in.',
+        ),
+    ] = None,
+    attach: Annotated[
+        bool, typer.Option('--attach', help='Show the graph that runs already; start no session.')
+    ] = False,
+    bag: Annotated[
+        Path | None,
+        typer.Option(help='Folder of a bag: show that, with a time line, instead of a session.'),
+    ] = None,
+    resimulate: Annotated[
+        bool, typer.Option('--resimulate', help='Compute the bag again, and show that beside it.')
+    ] = False,
+    changes: Changes = None,
+    seed: Seed = 0,
+    domain: Domain = '',
+) -> None:
+    """Run a session in the browser: see the tissue, drag the blade, cut. Ctrl-C ends it."""
+    from cutting_trainer.session.domain import parse_domain
+    from cutting_trainer.session.view_command import ViewOptions, run_view
+
+    if bag is not None:
+        from cutting_trainer.recordings.view_bag_command import ReplayOptions, view_bag
+        from cutting_trainer.session.scene_overrides import parse_changes
+
+        replayed = ReplayOptions(
+            bag, resimulate, parse_changes(changes or []), host, port, allow_host or ()
+        )
+        with reading(bag):
+            status = view_bag(replayed)
+        raise typer.Exit(int(status))
+    if resimulate or changes:
+        raise SessionError('--resimulate and --with are for a recorded session: give its --bag')
+    options = ViewOptions(
+        scene, host, port, attach, seed, parse_domain(domain), tuple(allow_host or ())
+    )
+    raise typer.Exit(int(run_view(options)))
+
+
+@commands.command(epilog=EXIT_STATUSES)
+def record(
+    output: Annotated[
+        Path | None,
+        typer.Option('--output', '-o', help='New folder for the bag (default: as of demo).'),
+    ] = None,
+    scene: Annotated[
+        str, typer.Option(help='Scene that the nodes run: its text goes into the bag.')
+    ] = '',
+    seed: Annotated[int, typer.Option(help='Of the session; goes into the bag.')] = 0,
+    domain: Annotated[str, typer.Option(help='ROS domain (default: ROS_DOMAIN_ID, 0).')] = '',
+    as_json: AsJson = False,
+) -> None:
+    """Record every topic of a graph that runs elsewhere, until Ctrl-C."""
+    from cutting_trainer.session.record_command import run_recorder
+
+    raise typer.Exit(int(run_recorder(output, scene, seed, domain, as_json=as_json)))
+
+
+@commands.command('probe-device', epilog=EXIT_STATUSES)
+def probe_device(
+    arm: Annotated[
+        str, typer.Option(help='Namespace of the device, as in /MTML for /MTML/measured_cp.')
+    ] = 'arm',
+    profile: Annotated[
+        str, typer.Option(help='Name of a file in config/devices, without .yaml.')
+    ] = 'emulated',
+    emulated: Annotated[
+        bool, typer.Option('--emulated', help='Start the emulated arm and probe that.')
+    ] = False,
+    moves: Annotated[
+        bool, typer.Option(help='Ask for moves and a turn: unit, handedness, scale, orientation.')
+    ] = True,
+    push: Annotated[
+        bool,
+        typer.Option(
+            '--push', help='Push the hand with 0.3 N: without it no force is sent at all.'
+        ),
+    ] = False,
+    force_topic: Annotated[
+        Literal['servo_cf', 'body/servo_cf', 'spatial/servo_cf'],
+        typer.Option(help='Where below the namespace it takes the force.'),
+    ] = 'servo_cf',
+    faults: Annotated[
+        str, typer.Option(help='With --emulated: what its driver gets wrong, as in "gain=5".')
+    ] = '',
+    domain: Domain = '',
+    as_json: AsJson = False,
+) -> None:
+    """Check a connected arm: stream, unit, handedness, scale, orientation, force, letting go."""
+    from cutting_trainer.session.domain import parse_domain
+    from cutting_trainer.session.probe_command import Emulation, ProbeOptions, run_probe
+
+    emulation = Emulation(faults=faults) if emulated else None
+    options = ProbeOptions(
+        arm, profile, emulation, moves, push, parse_domain(domain), as_json, force_topic
+    )
+    raise typer.Exit(int(run_probe(options)))

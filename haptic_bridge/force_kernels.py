@@ -1,0 +1,254 @@
+"""The compiled part of one tick: pose to tissue frame, force law, safety chain, force to device."""
+
+import numpy as np
+
+from cutting_trainer.haptic_bridge import extrapolation, safety
+from cutting_trainer.haptic_bridge.proxy import friction
+from cutting_trainer.haptic_bridge.proxy.coupling_spring import spring_force, surface_stiffness
+from cutting_trainer.haptic_bridge.proxy.record_type import record_type
+from cutting_trainer.haptic_bridge.scene_schema import (
+    DeviceProfile,
+    DeviceSettings,
+    HapticsSettings,
+    ToolSettings,
+)
+from cutting_trainer.node_common.kernels import inner, kernel
+
+NONE, TOUCHING, INSIDE = range(3)
+"""Contact states, as in `Contact`."""
+
+_VELOCITY_FILTER_S = 0.005
+"""[s] time constant of the low-pass on the damped velocity: encoder steps are coarse at 1 kHz."""
+
+_PASSIVITY_RECOVERY_S = 0.02
+"""[s] in which the passivity controller removes generated energy; faster feels like a kick."""
+
+_UNKNOWN_TISSUE_SHARE = 0.1
+"""Largest share of the device's force for a tissue of unknown stiffness."""
+
+MAX_SLEW_PERIOD_S = 0.005
+"""[s] Longest period that the slew limit allows for: a late tick catches up no further."""
+
+SETUP = record_type(
+    [
+        ('rotation', 'f8', (3, 3)),  # device frame to tissue frame
+        ('translation', 'f8', (3,)),  # [m]
+        ('scale', 'f8'),
+        ('force_scale', 'f8'),
+        ('blade', 'f8', (2, 3)),  # root and tip [m], tool frame
+        ('coupling', 'f8'),  # [N/m]
+        ('law', 'i8'),
+        ('one_force', 'b1'),
+        ('max_stiffness', 'f8'),  # [N/m], of the tissue
+        ('unknown_force', 'f8'),  # [N], of a tissue of unknown stiffness
+        ('slack', 'f8'),  # [N] by which a force may exceed the expected one
+        ('max_damping', 'f8'),  # [N s/m]
+        ('max_force', 'f8'),  # [N]
+        ('max_slew', 'f8'),  # [N/s]
+        ('body_frame', 'i8'),
+    ]
+)
+STATE = record_type(
+    [
+        ('device', 'f8', (3,)),  # [m], device frame
+        ('orientation', 'f8', (4,)),  # x y z w, device frame
+        ('tip', 'f8', (3,)),  # [m], tissue frame
+        ('blade', 'f8', (2, 3)),  # root and tip [m], tissue frame
+        ('moved', 'f8', (3,)),  # [m] since the last tick, device frame
+        ('velocity', 'f8', (3,)),  # [m/s], device frame
+        ('proxy', 'f8', (3,)),  # [m] on the undented surface
+        ('normal', 'f8', (3,)),
+        ('external', 'f8', (3,)),  # [N] on the tissue
+        ('resistance', 'f8'),  # [N]
+        ('known', 'f8'),  # [N/m] stiffness of the tissue; 0: unknown
+        ('held', 'f8'),  # [N] largest force that can hold the blade
+        ('reach', 'f8'),  # share of the resistance that a blade so far from the surface may feel
+        ('edge', 'f8', (2, 3)),  # [m] the blade of the last tick
+        ('stick', friction.STICK, (1,)),
+        ('energy', 'f8'),  # [J] of the passivity observer
+        ('damping', 'f8'),  # [N s/m] of the passivity controller
+        ('force', 'f8', (3,)),  # [N] commanded, device base frame
+        ('wrench', 'f8', (3,)),  # [N] the same in the frame that the device expects
+    ]
+)
+
+
+def make_setup(
+    tool: ToolSettings, device: DeviceSettings, haptics: HapticsSettings, profile: DeviceProfile
+) -> np.ndarray:
+    """Return the constants of a session for the kernels: dtype SETUP, shape (1,)."""
+    frame = device.tissue_from_device
+    setup = np.zeros(1, SETUP)
+    setup['rotation'] = frame.rotation()
+    setup['translation'] = frame.translation
+    setup['scale'] = frame.scale
+    setup['force_scale'] = haptics.force_scale
+    setup['blade'] = (tool.blade_root, tool.blade_tip)
+    setup['coupling'] = tool.coupling_stiffness
+    setup['law'] = extrapolation.LAWS[haptics.extrapolation]
+    setup['one_force'] = haptics.forces == 'one'
+    # The tissue is felt through the coupling spring: no steeper slope is real.
+    rendered = profile.max_stiffness / (frame.scale * haptics.force_scale)
+    setup['max_stiffness'] = min(rendered, tool.coupling_stiffness)
+    setup['unknown_force'] = _UNKNOWN_TISSUE_SHARE * profile.max_force / haptics.force_scale
+    allowed = profile.max_slew * MAX_SLEW_PERIOD_S / haptics.force_scale
+    setup['slack'] = min(setup['unknown_force'][0], allowed)
+    setup['max_damping'] = haptics.max_damping
+    setup['max_force'] = profile.max_force
+    setup['max_slew'] = profile.max_slew
+    setup['body_frame'] = device.force_frame == 'body'
+    return setup
+
+
+@inner
+def _rotate(q: np.ndarray, v: np.ndarray, sign: float, out: np.ndarray) -> None:
+    """Rotate v by the quaternion q (x y z w), or back with sign -1. Shapes (4,), (3,), (3,)."""
+    x, y, z, w = sign * q[0], sign * q[1], sign * q[2], q[3]
+    a = 2.0 * (y * v[2] - z * v[1])
+    b = 2.0 * (z * v[0] - x * v[2])
+    c = 2.0 * (x * v[1] - y * v[0])
+    out[0], out[1], out[2] = (
+        v[0] + w * a + y * c - z * b,
+        v[1] + w * b + z * a - x * c,
+        v[2] + w * c + x * b - y * a,
+    )
+
+
+@kernel(nogil=True)
+def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
+    """Write a checked device pose, transformed to the tissue frame, to the state.
+
+    Position [m] and quaternion, shape (7,).
+    """
+    c, s = setup[0], state[0]
+    for k in range(3):
+        s.moved[k] += values[k] - s.device[k]
+        s.device[k] = values[k]
+    for k in range(4):
+        s.orientation[k] = values[3 + k]
+    arm = np.empty(3)
+    for k in range(3):
+        s.tip[k] = c.translation[k]
+        for j in range(3):
+            s.tip[k] += c.scale * c.rotation[k, j] * values[j]
+    for end in range(2):
+        _rotate(s.orientation, c.blade[end], 1.0, arm)
+        for k in range(3):
+            s.blade[end, k] = s.tip[k]
+            for j in range(3):
+                s.blade[end, k] += c.rotation[k, j] * arm[j]
+
+
+@inner
+def _tissue_force(
+    setup: np.ndarray,
+    state: np.ndarray,
+    history: np.ndarray,
+    contact: int,
+    time: int,
+    out: np.ndarray,
+) -> None:
+    """Compute the force of the tissue on the tool now [N], tissue frame, shape (3,)."""
+    c, s, h = setup[0], state[0], history[0]
+    out[:] = 0.0
+    if contact == NONE:
+        return
+    if h.count > 0 and not (c.one_force and contact == TOUCHING):
+        depth = s.proxy - s.tip
+        touching = contact == TOUCHING
+        extrapolation.estimate(c.law, history, time, s.tip, depth, touching, c.max_stiffness, out)
+    elif contact == TOUCHING:
+        for k in range(3):
+            out[k] = -s.external[k]  # until the tissue has answered
+        if h.count == 0 and not np.any(h.stiffness):
+            safety.clamp(c.unknown_force, out)
+    if contact == TOUCHING:
+        outward = out[0] * s.normal[0] + out[1] * s.normal[1] + out[2] * s.normal[2]
+        if outward < 0.0:
+            out[:] = 0.0
+        # Bounded by the force that this depth of the coupling spring and the known stiffness allow.
+        safety.clamp(s.known * safety.norm(s.proxy - s.tip) + c.slack, out)
+        if s.stick[0].sliding_friction > 0.0:
+            _add_friction(setup, state, history, out)
+    else:
+        # The blade transmits at most the cutting resistance: zero while no part is in tissue.
+        # It may exceed the last bound only by the stretch of its spring since then.
+        safety.clamp(min(s.reach * s.resistance, s.held), out)
+
+
+@inner
+def _add_friction(
+    setup: np.ndarray, state: np.ndarray, history: np.ndarray, out: np.ndarray
+) -> None:
+    """Replace what of the force is along the surface by friction, here and in the contact."""
+    c, s, h = setup[0], state[0], history[0]
+    stick, n = s.stick[0], s.normal
+    pushed = max(out[0] * n[0] + out[1] * n[1] + out[2] * n[2], 0.0)
+    stiffness = stick.stiffness
+    if stiffness == 0.0:
+        stiffness = surface_stiffness(h.stiffness, c.coupling)
+    friction.drag(s.stick, s.tip, n, pushed, min(stiffness, c.max_stiffness))
+    # The contact's force is that of the spring, whose normal part may differ from the one felt.
+    share = safety.norm(s.external) / pushed if pushed > 0.0 else 0.0
+    for k in range(3):
+        out[k] = pushed * n[k] + stick.force[k]
+        s.external[k] -= share * stick.force[k]
+
+
+@inner
+def _follow_edge(setup: np.ndarray, state: np.ndarray) -> None:
+    """Raise the bound of the blade's force by the stretch of its spring since the last tick."""
+    s = state[0]
+    stretch = max(safety.norm(s.blade[0] - s.edge[0]), safety.norm(s.blade[1] - s.edge[1]))
+    s.held += setup[0].coupling * stretch
+    for end in range(2):
+        for k in range(3):
+            s.edge[end, k] = s.blade[end, k]
+
+
+@kernel(nogil=True)
+def command(
+    setup: np.ndarray,
+    state: np.ndarray,
+    history: np.ndarray,
+    contact: int,
+    enabled: bool,
+    time: int,
+    gain: float,
+    elapsed: float,
+) -> bool:
+    """Compute the commanded force and wrench from a checked input, through the safety chain.
+
+    Returns:
+        False where the result was not finite; the force is then zero.
+    """
+    c, s = setup[0], state[0]
+    s.energy = safety.observe(s.energy, s.force, s.moved)
+    weight = elapsed / (elapsed + _VELOCITY_FILTER_S)
+    for k in range(3):
+        s.velocity[k] += weight * (s.moved[k] / elapsed - s.velocity[k])
+        s.moved[k] = 0.0
+    spring_force(history[0].stiffness, c.coupling, s.tip, s.proxy, s.external)
+    _follow_edge(setup, state)
+    felt = np.zeros(3)
+    wanted = np.zeros(3)
+    _tissue_force(setup, state, history, contact, time, felt)
+    for k in range(3):
+        for j in range(3):
+            wanted[k] += c.force_scale * c.rotation[j, k] * felt[j]
+    safety.state_gate(enabled, wanted)
+    s.damping = 0.0
+    if enabled and contact != NONE:
+        s.damping = safety.control(
+            s.energy, s.velocity, _PASSIVITY_RECOVERY_S, c.max_damping, wanted
+        )
+    safety.settle(s.force, c.max_slew * elapsed, c.max_force, gain, wanted)
+    finite = np.isfinite(safety.norm(wanted))
+    for k in range(3):
+        s.force[k] = wanted[k] if finite else 0.0
+    if c.body_frame:
+        _rotate(s.orientation, s.force, -1.0, s.wrench)
+    else:
+        for k in range(3):
+            s.wrench[k] = s.force[k]
+    return finite

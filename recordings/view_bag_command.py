@@ -1,0 +1,123 @@
+"""`trainer view --bag`: show a recorded session in the browser, beside its recomputation."""
+
+import signal
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from cutting_trainer.bags.playback_messages import first_time
+from cutting_trainer.bags.reader import Bag, open_bag
+from cutting_trainer.bags.resimulation import answer_frames, as_recorded
+from cutting_trainer.bags.resimulation_start import computable_frames
+from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate_command import recomputation
+from cutting_trainer.recordings.what_if import (
+    Hand,
+    closed_loop,
+    computable_poses,
+    time_of_contact,
+)
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.in_process import make_force_path
+from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.tissue_sim.contact.tool import Frame
+from cutting_trainer.viewer.access_control import link, make_gate
+from cutting_trainer.viewer.bag_timeline import ComputedTissue
+from cutting_trainer.viewer.replay_page import ReplayPage
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Options of `view --bag`.
+
+    Attributes:
+        bag: folder of the bag.
+        resimulate: recompute the session, and show both.
+        changes: changes of the scene for the recomputation, by dotted key.
+        host, port: address and port of the page.
+        allow_host: host names under which the page is served.
+    """
+
+    bag: Path
+    resimulate: bool
+    changes: Mapping[str, str]
+    host: str
+    port: int
+    allow_host: Sequence[str] = ()
+
+
+def view_bag(options: ReplayOptions) -> Status:
+    """Serve the page until the user ends it.
+
+    Raises:
+        BagError, SessionError, SceneError, PageError: an option or the bag is not valid.
+    """
+    bag = open_bag(options.bag)
+    notes = Console(stderr=True)
+    computed, name = None, ''
+    host, port, names = options.host, options.port, options.allow_host
+    gate = make_gate(host, names)
+    with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
+        scene = load_scene(str(restore_scene(bag, Path(temporary), options.changes)))
+        if options.resimulate or options.changes:
+            name = ', '.join(f'{k}={v}' for k, v in options.changes.items()) or 'computed again'
+            computed = resimulated(bag, scene, notes, changed=bool(options.changes))
+        page = ReplayPage(bag, scene.tool, scene.device, computed, name, host, port, gate)
+    with _interrupts() as seen:
+        shown = link(host, page.server.port, names, gate.token)
+        notes.print(f'page: {shown} (Ctrl-C ends it)', highlight=False, soft_wrap=True)
+        page.run(lambda: bool(seen))
+    page.server.stop()
+    return Status.OK
+
+
+def resimulated(bag: Bag, scene: Scene, notes: Console, *, changed: bool) -> ComputedTissue:
+    """Recompute a session for the page.
+
+    Args:
+        bag: bag of the session.
+        scene: recorded scene, or a changed one.
+        notes: console for the progress.
+        changed: the recorded hand acts on another tissue; else the recorded contacts load it.
+
+    Raises:
+        BagError: a frame cannot be computed.
+    """
+    warm_up_cutting(scene.cutting)
+    beginning, records = computable_frames(bag)
+    computed = recomputation(scene, beginning, changed=changed)
+    tissue, origin = ComputedTissue(), first_time(bag)
+    if changed:
+        records, poses = computable_poses(bag)
+        hand = Hand(make_force_path(scene))
+        untils = [time_of_contact(record) for record in records]
+        computed.answer_frames = answer_frames(records)
+        frames: Iterator[Frame] = (frame for frame, _ in closed_loop(poses, untils, hand, computed))
+    else:
+        frames = as_recorded(records, computed)
+    with Progress(console=notes, transient=True) as progress:
+        pairs = zip(records, frames, strict=True)
+        for record, frame in progress.track(pairs, len(records), description='computing frames'):
+            force = float(np.linalg.norm(frame.force))
+            tissue.add((record.time - origin) * 1e-9, computed.simulation, force)
+    return tissue
+
+
+@contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Yield a list that grows with each signal that asks for the end."""
+    seen: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {n: signal.signal(n, lambda number, _: seen.append(number)) for n in numbers}
+    try:
+        yield seen
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,309 @@
+"""A recorded hand on a changed tissue: the poses are recorded, all else is recomputed.
+
+Proxy, tissue and cutting run together without ROS. Each recorded pose is a tick of the force loop,
+and each frame of the tissue comes at the same pose as in the session. A cut is answered after as
+many frames as in the session. The hand does not yield to the force: it follows the recorded path.
+The result is compared with the recorded session, of which only the tissue is recomputed.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from cutting_trainer.bags.comparison import MAX_ROUNDING
+from cutting_trainer.bags.reader import Bag
+from cutting_trainer.bags.recorded_frames import FrameRecord, contact_message, read_run
+from cutting_trainer.bags.resimulation import Resimulation, answer_frames, as_recorded
+from cutting_trainer.bags.resimulation_start import find_beginning
+from cutting_trainer.bags.topic_names import CONTACT, POSE, SERVO_CF, of_session
+from cutting_trainer.haptic_bridge.force_kernels import NONE
+from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.node_common.cdr_codec import (
+    ContactCodec,
+    ForceSampleCodec,
+    PoseStampedCodec,
+    StampedMessage,
+    WrenchStampedCodec,
+)
+from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.in_process import make_force_path
+from cutting_trainer.session.scene_loader import Scene
+from cutting_trainer.tissue_sim.contact.incoming import tool_contact
+from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact
+
+_FRAME_NS, _TICK_NS = 33_333_333, 1_000_000
+_NANOSECOND_S = 1e-9
+
+
+@dataclass
+class Run:
+    """Result of one computation of a session.
+
+    Attributes:
+        times: times of the ticks since the first pose [s], shape (n,).
+        forces: norm of the force on the hand [N], shape (n,).
+        contact: contact flag, shape (n,).
+        area: area of the incision, one side, at rest [m^2].
+        elements_cut: number of tetrahedra removed by cuts.
+        tetrahedra: number of tetrahedra at the end.
+        substeps: number of substeps of all frames.
+        diverged: number of frames rolled back.
+    """
+
+    times: np.ndarray
+    forces: np.ndarray
+    contact: np.ndarray
+    area: float
+    elements_cut: int
+    tetrahedra: int
+    substeps: int
+    diverged: int
+
+    def table(self, changed: 'Run', changes: Mapping[str, str]) -> Table:
+        """Return a table of this run and a changed one."""
+        title = ', '.join(f'{key}={value}' for key, value in changes.items())
+        table = Table(title=title, box=box.SIMPLE_HEAD)
+        for column in ('', 'as recorded', 'changed', 'difference'):
+            table.add_column(column, justify='right' if column else 'left')
+        for name, digits, before, after in (
+            ('largest force on the hand [N]', 3, self.peak, changed.peak),
+            ('mean force in contact [N]', 3, self.mean, changed.mean),
+            ('contact [s]', 2, self.contact_time, changed.contact_time),
+            ('area of the incision [cm^2]', 3, self.area * 1e4, changed.area * 1e4),
+            ('elements cut', 0, self.elements_cut, changed.elements_cut),
+            ('tetrahedra at the end', 0, self.tetrahedra, changed.tetrahedra),
+            ('substeps', 0, self.substeps, changed.substeps),
+            ('frames rolled back', 0, self.diverged, changed.diverged),
+        ):
+            cells = (f'{before:.{digits}f}', f'{after:.{digits}f}', f'{after - before:+.{digits}f}')
+            table.add_row(escape(name), *cells)
+        off = np.abs(changed.forces - self.forces)
+        at = int(off.argmax())
+        table.add_row(
+            'force at the same moment, rms [N]', '', '', f'{np.sqrt(np.mean(off**2)):.3f}'
+        )
+        where = f'force, farthest apart [N], at {self.times[at]:.2f} s'
+        table.add_row(
+            where, f'{self.forces[at]:.3f}', f'{changed.forces[at]:.3f}', f'{off[at]:.3f}'
+        )
+        return table
+
+    def figures(self) -> dict[str, float]:
+        """Return the figures in SI units, for JSON."""
+        return {
+            'largest_force': self.peak,
+            'mean_force_in_contact': self.mean,
+            'contact': self.contact_time,
+            'incision_area': self.area,
+            'elements_cut': self.elements_cut,
+            'tetrahedra': self.tetrahedra,
+            'substeps': self.substeps,
+            'frames_taken_back': self.diverged,
+        }
+
+    @property
+    def peak(self) -> float:
+        return float(self.forces.max(initial=0.0))
+
+    @property
+    def mean(self) -> float:
+        return float(self.forces[self.contact].mean()) if self.contact.any() else 0.0
+
+    @property
+    def contact_time(self) -> float:
+        return float(np.diff(self.times, prepend=self.times[:1])[self.contact].sum())
+
+
+@dataclass
+class Hand:
+    """Device and force loop, with their state.
+
+    Attributes:
+        path: force loop.
+        state: operating state.
+        surface, sample: newest surface and force sample; the next tick takes the sample.
+        contact: contact of the last tick, None before the first.
+        ticks: time [ns], norm of the force [N] and contact flag of each tick.
+    """
+
+    path: ForcePath
+    state: CrtkState = CrtkState.DISABLED
+    surface: Surface | None = None
+    sample: StampedMessage | None = None
+    contact: StampedMessage | None = None
+    ticks: list[tuple[int, float, bool]] = field(default_factory=list)
+
+    def tick(self, pose: StampedMessage) -> None:
+        now = pose.stamp_ns
+        sample, self.sample = self.sample, None
+        tick = self.path.tick(now, state=self.state, pose=pose, sample=sample, surface=self.surface)
+        if tick.fault:
+            raise SessionError(f'the haptic bridge comes to a FAULT: {tick.fault}')
+        if self.state is CrtkState.DISABLED and self.path.is_fresh(now):
+            self.state = CrtkState.ENABLED
+        self.contact = StampedMessage(tick.contact_stamp_ns, '', tick.contact)
+        self.ticks.append((now, self.path.force_norm, self.path.contact != NONE))
+
+
+def run_experiment(bag: Bag, scene: Scene, computed: Resimulation) -> Run:
+    """Compute a session from the poses of its device.
+
+    Args:
+        bag: bag of the session.
+        scene: recorded scene, or a changed one.
+        computed: simulation and cutting of that scene, before the first frame.
+
+    Raises:
+        SessionError: the bag has no poses, or the changed session ends in a FAULT.
+    """
+    records, poses = computable_poses(bag)
+    untils = [time_of_contact(record) for record in records]
+    hand = Hand(make_force_path(scene))
+    computed.answer_frames = answer_frames(records)
+    for _ in closed_loop(poses, untils, hand, computed):
+        pass
+    times, forces, contact = (np.array(column) for column in zip(*hand.ticks, strict=True))
+    return _run(times, forces, contact, computed)
+
+
+def recorded_run(bag: Bag, computed: Resimulation) -> tuple[Run, int | None]:
+    """Return the recorded session: force and contact from the bag, the tissue recomputed.
+
+    Args:
+        bag: bag of the session.
+        computed: simulation and cutting of its scene, before the first frame.
+
+    Returns:
+        The session, and the first frame whose force differs from the recorded one by more than
+        rounding; None: there is none.
+
+    Raises:
+        BagError: a frame cannot be recomputed.
+        SessionError: the bag has no poses, or no forces of the hand.
+    """
+    (records, poses), differs = computable_poses(bag), None
+    place = ForceSampleCodec.fields['force']
+    for record, frame in zip(records, as_recorded(records, computed), strict=True):
+        was = frame.force if record.force is None else np.array(record.force.values[place])
+        off = float(np.abs(frame.force - was).max())
+        if differs is None and off > MAX_ROUNDING * np.abs(was).max():
+            differs = record.step
+    state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
+    times = np.array([pose.stamp_ns for pose in poses])
+    touched = _at(bag, CONTACT, ContactCodec(), times)[:, state].ravel() != NONE
+    forces = np.linalg.norm(_at(bag, SERVO_CF, WrenchStampedCodec(), times)[:, force], axis=1)
+    return _run(times, forces, touched, computed), differs
+
+
+def _run(times: np.ndarray, forces: np.ndarray, contact: np.ndarray, computed: Resimulation) -> Run:
+    return Run(
+        times=(times - times[0]) * _NANOSECOND_S,
+        forces=forces,
+        contact=contact,
+        area=computed.area,
+        elements_cut=computed.simulation.elements_cut,
+        tetrahedra=len(computed.simulation.mesh.tetrahedra),
+        substeps=computed.substeps,
+        diverged=computed.diverged,
+    )
+
+
+def computable_poses(bag: Bag) -> tuple[list[FrameRecord], list[StampedMessage]]:
+    """Return the computable frames of a session, and the poses of the device during them.
+
+    Raises:
+        BagError: no frame can be computed; the message has the reason.
+        SessionError: the bag has no poses.
+    """
+    beginning = find_beginning(bag)
+    every, _ = read_run(bag, beginning.segment.run)
+    records, after = beginning.frames(every), 0
+    if beginning.tissue is not None:
+        before = [record for record in every if record.step < beginning.step]
+        # A tissue that is not computed has answered the poses of the frame before.
+        first = time_of_contact(records[0])
+        after = time_of_contact(before[-1]) if before else first - _FRAME_NS
+    until = max((time_of_contact(record) for record in records), default=0)
+    codec, topic = PoseStampedCodec(), of_session(POSE, bag.topics())
+    decoded = (
+        codec.decode(recorded.data)
+        for recorded in bag.messages([topic])
+        if recorded.log_time >= beginning.segment.since
+    )
+    poses = [pose for pose in decoded if after < pose.stamp_ns <= until]
+    if not poses:
+        raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
+    return records, poses
+
+
+def _at(bag: Bag, topic: str, codec: Any, times: np.ndarray) -> np.ndarray:
+    """Return the values of a 1 kHz stream in answer to poses at times [ns], shape (n, values)."""
+    topic = of_session(topic, bag.topics())
+    samples = [codec.decode(recorded.data) for recorded in bag.messages([topic])]
+    if not samples:
+        raise SessionError(f'{bag.path} has no message of {topic}: --with compares with it')
+    stamps = np.array([sample.stamp_ns for sample in samples])
+    newest = np.searchsorted(stamps, np.append(times[1:], times[-1] + _TICK_NS)) - 1
+    return np.array([sample.values for sample in samples])[np.maximum(newest, 0)]
+
+
+def closed_loop(
+    poses: Sequence[StampedMessage], untils: Iterable[int], hand: Hand, computed: Resimulation
+) -> Iterator[tuple[Frame, int]]:
+    """Tick the force loop with each pose, and compute each frame at its time.
+
+    Args:
+        poses: poses of the device, in order.
+        untils: for each frame, stamp [ns] of the last pose before it.
+        hand: hand before its first tick.
+        computed: recomputation before its first frame.
+
+    Yields:
+        Each frame, and the result of the cut requested before it (see `FrameInputs.answer`).
+    """
+    next_pose = 0
+    for until in untils:
+        while next_pose < len(poses) and poses[next_pose].stamp_ns <= until:
+            hand.tick(poses[next_pose])
+            next_pose += 1
+        answer = computed.answer()
+        frame = computed.frame(_contact(computed, hand))
+        _show(computed, hand, frame)
+        yield frame, answer
+
+
+def time_of_contact(record: FrameRecord) -> int:
+    """Return the stamp [ns] of the last pose before a frame."""
+    return record.pose.stamp_ns if record.pose is not None else record.time - _FRAME_NS
+
+
+def _contact(computed: Resimulation, hand: Hand) -> ToolContact | None:
+    if hand.contact is None:
+        return None
+    return tool_contact(contact_message(hand.contact), computed.simulation.mesh)
+
+
+def _show(computed: Resimulation, hand: Hand, frame: Frame) -> None:
+    """Pass force sample and surface of a frame to the force loop."""
+    simulation = computed.simulation
+    sequence = 0 if hand.contact is None else int(hand.contact.values[0])
+    stamp = 0 if hand.contact is None else hand.contact.stamp_ns
+    head = (frame.step, frame.step, simulation.mesh.topology, sequence)
+    vectors = (*frame.position, *frame.force, *frame.stiffness.ravel())
+    energies = (frame.resistance, frame.kinetic_energy, frame.elastic_energy)
+    values = (*head, *divmod(stamp, 1_000_000_000), int(frame.state), *vectors, *energies, 0)
+    hand.sample = StampedMessage(max(stamp, 1), '', values)
+    hand.surface = Surface(
+        simulation.positions,
+        simulation.mesh.triangles,
+        revision=frame.step,
+        topology=simulation.mesh.topology,
+        previous=hand.surface,
+    )

@@ -1,0 +1,241 @@
+"""`trainer view`: a session that is controlled from a page in the browser."""
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+
+from cutting_trainer.node_common.errors import MeshError, SceneError
+from cutting_trainer.node_common.share_folder import scene_names
+from cutting_trainer.session.demo_command import new_bag, report_failed_start
+from cutting_trainer.session.domain import reserved_domain
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import (
+    RECORDER_NODE,
+    VIEWER_NODE,
+    node_environment,
+    recorder_command,
+    simulation_nodes,
+    viewer_command,
+)
+from cutting_trainer.session.node_process import NodeCommand
+from cutting_trainer.session.outcome import Outcome
+from cutting_trainer.session.progress import SessionProgress
+from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.session.scene_overrides import write_changed
+from cutting_trainer.session.supervisor import Event, Supervisor
+from cutting_trainer.session.terminal import session_console
+from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, make_gate
+from cutting_trainer.viewer.live_page import METHODS
+
+_FOREVER = 1e9
+_MAX_REQUESTS = 16
+"""Longest queue of requests; further ones are discarded."""
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Options of `view`.
+
+    Attributes:
+        scene: name or path.
+        host: address of the page.
+        port: port of the page; 0: any free port.
+        attach: show the graph that runs in the domain already, and start only the viewer.
+        seed: seed of all random numbers.
+        domain: ROS domain, or `free`.
+        allow_host: host names under which the page is served.
+    """
+
+    scene: str
+    host: str
+    port: int
+    attach: bool
+    seed: int
+    domain: int | Literal['free']
+    allow_host: tuple[str, ...] = ()
+
+
+def run_view(options: ViewOptions) -> Status:
+    """Serve the page until the user ends it.
+
+    Raises:
+        PageError, SessionError, SceneError, SettingsError: an option or the scene is not valid.
+    """
+    scene = load_scene(options.scene)
+    notes = session_console()
+    # Rejected here, before the start of any node; every start of the viewer has the token.
+    gate = make_gate(options.host, options.allow_host)
+    os.environ[TOKEN_VARIABLE] = gate.token
+    viewer = viewer_command(
+        scene.path,
+        options.host,
+        options.port,
+        session=not options.attach,
+        allow_host=options.allow_host,
+    )
+    if options.attach:
+        domain = 0 if options.domain == 'free' else options.domain
+        return _attach(viewer, domain, notes)
+    with (
+        reserved_domain(options.domain) as domain,
+        tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
+    ):
+        session = _Session(scene, options, Path(temporary), notes)
+        nodes = [viewer, *session.nodes()]
+        with (
+            SessionProgress(notes, len(nodes)) as progress,
+            Supervisor(
+                nodes,
+                Path(temporary) / 'log',
+                node_environment(domain),
+                session.event_handler(progress),
+                restart=True,
+            ) as supervisor,
+        ):
+            if supervisor.start():
+                supervisor.run(_FOREVER, tick=lambda _: session.serve(supervisor))
+            outcome = supervisor.end()
+        return _status(outcome, Path(temporary), notes)
+
+
+def _attach(viewer: NodeCommand, domain: int, notes: Console) -> Status:
+    with (
+        tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
+        SessionProgress(notes, 1) as progress,
+        Supervisor(
+            [viewer], Path(temporary) / 'log', node_environment(domain), progress.show
+        ) as supervisor,
+    ):
+        if supervisor.start():
+            supervisor.run(_FOREVER)
+        return _status(supervisor.end(), Path(temporary), notes)
+
+
+def _status(outcome: Outcome, folder: Path, notes: Console) -> Status:
+    """Return the exit status; Ctrl-C is the normal end of a view."""
+    if not outcome.ran:
+        return report_failed_start(outcome, folder, notes)
+    return Status.OK if outcome.interrupted else Status.NODE_DIED
+
+
+class _Session:
+    """Serve the requests of the page to the launcher, between two polls of the nodes.
+
+    Args:
+        scene: first scene.
+        options: options of the command line.
+        folder: existing folder for changed scenes.
+        notes: console for details that the page must not have.
+    """
+
+    def __init__(self, scene: Scene, options: ViewOptions, folder: Path, notes: Console) -> None:
+        self._scene, self._options, self._folder = scene, options, folder
+        self._notes = notes
+        self._sources = {scene.name: options.scene}  # the name alone may not lead to the file
+        self._file = scene.path
+        self._method: str = scene.cutting.method
+        self._recording: Path | None = None
+        self._is_new = True  # the viewer does not have the scene file of the nodes yet
+        self._asked: list[dict[str, Any]] = []
+
+    def nodes(self) -> list[NodeCommand]:
+        """Return the commands of the nodes that restart together."""
+        return simulation_nodes(self._file, self._options.seed, self._folder / 'tissue.checkpoint')
+
+    def event_handler(self, progress: SessionProgress) -> Callable[[Event], None]:
+        """Return a handler of the supervisor's events."""
+
+        def handle(event: Event) -> None:
+            if event.kind == 'ready' and event.node == VIEWER_NODE:
+                self._asked.append({'ask': 'state'})
+            if event.kind == 'message' and 'ask' in event.content:
+                if len(self._asked) < _MAX_REQUESTS:
+                    self._asked.append(dict(event.content))
+                return
+            progress.show(event)
+
+        return handle
+
+    def serve(self, supervisor: Supervisor) -> None:
+        """Serve the requests since the last call."""
+        while self._asked:
+            request = self._asked.pop(0)
+            try:
+                self._do(request, supervisor)
+                problem = ''
+            except (SessionError, SceneError, MeshError, ValueError) as error:
+                problem = 'This could not be done: the terminal says why.'
+                self._notes.print(f'asked by the page: {error}', style='red', markup=False)
+            except (KeyError, TypeError):  # no page of ours asks so
+                problem = 'The request of the page could not be understood: nothing was done.'
+            self._answer(supervisor, problem=problem)
+
+    def _do(self, request: dict[str, Any], supervisor: Supervisor) -> None:
+        if request['ask'] == 'restart':
+            name = request.get('scene', self._scene.name)
+            if name not in (*self._sources, *scene_names()):
+                raise SessionError('the requested scene is not one of those on offer')
+            if (method := request.get('method', self._method)) not in METHODS:
+                raise SessionError('the requested method of cutting does not exist')
+            self._restart(name, method, supervisor)
+        elif request['ask'] == 'state':  # the viewer has just started
+            self._is_new = True
+        elif request['ask'] == 'record' and request.get('on') is (self._recording is None):
+            self._record(request['on'], supervisor)
+
+    def _record(self, on: bool, supervisor: Supervisor) -> None:
+        """Start a bag, or end the present one."""
+        busy = 'The recorder starts ...' if on else 'The recorder closes its bag ...'
+        self._answer(supervisor, busy=busy)
+        if on:
+            bag = new_bag(None, self._scene.name)
+            command = recorder_command(self._file, bag, self._options.seed)
+            self._recording = bag
+            if not supervisor.replace([command]):
+                supervisor.remove([RECORDER_NODE])
+                self._recording = None
+                raise SessionError('the recorder did not start: its log has the reason')
+        else:
+            supervisor.remove([RECORDER_NODE])
+            self._recording = None
+
+    def _restart(self, name: str, method: str, supervisor: Supervisor) -> None:
+        """Restart the nodes. A bag holds one tissue: the present one ends, and a new one starts."""
+        scene = load_scene(self._sources.get(name, name))
+        changes = {} if method == scene.cutting.method else {'cutting.method': method}
+        if scene.name != self._scene.name and method == self._method:
+            changes, method = {}, scene.cutting.method  # another scene has its own method
+        recorded = self._recording is not None
+        self._answer(supervisor, busy='The nodes start again ...')
+        if recorded:
+            supervisor.remove([RECORDER_NODE])
+            self._recording = None
+        self._scene, self._method = scene, method
+        self._file = write_changed(scene, self._folder, changes) if changes else scene.path
+        self._is_new = True  # the file may have changed under the same name
+        if not supervisor.replace(self.nodes()):
+            outcome = supervisor.outcome
+            why = outcome.unready or (outcome.deaths[-1].sentence if outcome.deaths else '')
+            raise SessionError(why or 'the start was interrupted')
+        if recorded:
+            self._record(True, supervisor)
+
+    def _answer(self, supervisor: Supervisor, *, busy: str = '', problem: str = '') -> None:
+        sends_file = self._is_new and not busy
+        state = {
+            'scene': self._scene.name,
+            'method': self._method,
+            'recording': self._recording.name if self._recording else '',
+            'busy': busy,
+            'problem': problem,
+            'scene_file': str(self._file) if sends_file else '',
+        }
+        self._is_new = self._is_new and not sends_file
+        supervisor.answer(VIEWER_NODE, json.dumps(state))

@@ -1,0 +1,8 @@
+"""Colours of the tissue and of the cut, for pages and for markers: red, green, blue, 0 to 255."""
+
+Colour = tuple[int, int, int]
+
+TISSUE: Colour = (205, 118, 100)
+CUT: Colour = (120, 8, 22)
+OTHER_TISSUE: Colour = (120, 140, 190)
+"""A tissue that is computed again, beside the recorded one."""
