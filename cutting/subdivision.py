@@ -162,7 +162,7 @@ def subdivide(parents, links, tables, positions, rest, tau, plain):
     kept: dict[int, bool] = {}
     count = np.int64(0)  # of a literal, Numba would compile `_gathered` once more
     first_new = len(rest)
-    new = np.int64(0)
+    new, unknown = np.int64(0), np.int64(-1)
     ids = np.empty(INSIDE + 1, np.int64)
     for p in range(len(parents)):
         parent = parents[p]
@@ -170,20 +170,8 @@ def subdivide(parents, links, tables, positions, rest, tau, plain):
         state = STATE[edges, nodes] if edges else -1
         states[p] = state
         if edges and state < 0:
-            return _gathered(
-                corners,
-                labels,
-                owners,
-                outer,
-                states,
-                removed,
-                new_parents,
-                new_weights,
-                rest,
-                kept,
-                np.int64(0),
-                np.int64(0),
-            ), parent
+            unknown, count, new = np.int64(parent), np.int64(0), np.int64(0)
+            break
         ids[:] = -1
         for k in range(tables.child_count[parent]):
             tet = tables.children[parent, k]
@@ -233,7 +221,7 @@ def subdivide(parents, links, tables, positions, rest, tau, plain):
         kept,
         count,
         new,
-    ), -1
+    ), unknown
 
 
 @inner
