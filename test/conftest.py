@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -27,6 +28,7 @@ BUILT = pytest.StashKey[Path]()
 ALONE = {'alone', 'real_time'}
 LEFT_OUT = {'quick': {'long', 'thorough', *ALONE}, 'usual': {'thorough'}, 'all': set[str]()}
 """Marks of the tests that a tier leaves out."""
+MODULE_MARKS = re.compile(r'^pytestmark = (\[[^\]]*\]|.*)', re.MULTILINE)
 RUN = 'TRAINER_TEST_RUN'
 """Variable by which the processes that a test starts are known."""
 
@@ -60,6 +62,19 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not config.getoption('numprocesses', None):  # else each worker has its own
         os.environ[RUN] = str(os.getpid())
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import a module of which tier or part leave out all: imports take seconds."""
+    if collection_path.suffix != '.py' or not collection_path.is_file():
+        return None
+    text, part = collection_path.read_text(encoding='utf-8'), config.getoption('part')
+    if part == 'alone' and not any(f'mark.{name}' in text for name in ALONE):
+        return True
+    found = MODULE_MARKS.search(text)
+    marks = set(re.findall(r'pytest\.mark\.(\w+)', found[1])) if found else set()
+    left_out = LEFT_OUT[config.getoption('tier')] | (ALONE if part == 'beside' else set())
+    return True if marks & left_out else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

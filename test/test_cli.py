@@ -288,6 +288,7 @@ def test_a_sentence_of_the_trainer_about_a_bag_stays_as_it_is() -> None:
         int('nothing')
 
 
+@pytest.mark.long
 def test_tests_that_failed_alone_run_again_by_themselves_and_only_they(tmp_path: Path) -> None:
     (tmp_path / 'test_two.py').write_text(
         'from pathlib import Path\n'

@@ -141,6 +141,7 @@ def test_no_contact_however_forged_makes_it_much_stiffer_than_the_coupling(stiff
         assert np.abs(matrix).max() <= 4.001 * stiffness
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('model', ['linear', 'linear_smoothed'])
 def test_a_splinter_that_nothing_holds_has_a_stiffness_between_none_and_the_spring_s(model) -> None:
     nodes, tets = box((1, 1, 1), SIZE)

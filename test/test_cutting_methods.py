@@ -78,6 +78,7 @@ def test_separation_alone_makes_no_elements_and_a_jagged_cut():
     assert np.sqrt(np.square(distances(mesh)).mean()) > 0.15
 
 
+@pytest.mark.long
 def test_deletion_loses_mass_and_leaves_a_gap():
     mesh = block(0)
     volume = mesh.volumes().sum()

@@ -28,6 +28,7 @@ def plate() -> Organ:
     return slab((12, 12, 2))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('ratio', 'seed'), [(2, 0), (2, 3), (2, 6), (3, 2), (3, 3), (4, 1)])
 def test_a_circle_through_a_slab_frees_its_plug_where_the_blade_went(plate, ratio, seed):
     run = measure(plate, circle(plate, ratio, np.random.default_rng(seed)), check=True)
@@ -86,6 +87,7 @@ def test_strokes_that_cross_near_their_ends_free_a_plug():
     assert run.error == '' and run.free
 
 
+@pytest.mark.long
 def test_elements_around_a_node_put_on_the_cut_are_divided_anew(cloud):
     run = measure(cloud, curved(cloud, 'loop', np.random.default_rng(1015)))
     assert run.error == '' and run.faces == 0

@@ -191,6 +191,7 @@ def test_a_press_of_a_millimetre_is_that_of_sneddon_on_a_layer(radius: float) ->
     assert found == pytest.approx(exact, rel=0.07)
 
 
+@pytest.mark.long
 def test_a_deep_press_is_that_of_quadratic_neo_hookean_elements() -> None:
     layer = Layer(BLOCK[2], 0.0564, MATERIAL.youngs_modulus, MATERIAL.poissons_ratio)
     reference = SphereOnLayer(layer, 0.008, 0.0016, large=True)

@@ -50,6 +50,7 @@ def vibrate(integrator: IntegratorName, steps: int, seconds: float) -> float:
     return float(np.abs(u - exact).max() / np.abs(shapes).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('integrator', 'order', 'steps'),
     [('euler', 1, 400), ('symplectic_euler', 1, 200), ('rk4', 4, 60), ('implicit', 1, 200)],
@@ -135,6 +136,7 @@ def grown_by(integrator: IntegratorName, name: ModelName, nu: float, share: floa
     return model.evaluate(u.reshape(-1, 3))[1] / start
 
 
+@pytest.mark.long
 @every_model
 @pytest.mark.parametrize('nu', [0.4, 0.499])
 @every_integrator

@@ -57,6 +57,7 @@ def press(tissue: TissueSimulation, frames: int, depth: float = 0.003) -> list[s
     return troubles
 
 
+@pytest.mark.long
 @every_integrator
 @every_model
 def test_the_default_share_of_the_step_gives_no_trouble(
@@ -187,6 +188,7 @@ def cut_block(name: ModelName, integrator: IntegratorName, method: str) -> Tissu
     return tissue
 
 
+@pytest.mark.long
 @every_integrator
 @every_model
 def test_after_a_cut_through_elements_the_bound_holds_and_the_lips_come_to_rest(
@@ -224,6 +226,7 @@ def test_an_inverted_element_does_not_blow_up(name: ModelName, integrator) -> No
     assert np.abs(tissue.displacement).max() < 1e-3
 
 
+@pytest.mark.long
 @every_integrator
 @every_model
 def test_a_tool_that_jumps_through_the_tissue_is_not_believed(

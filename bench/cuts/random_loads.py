@@ -71,7 +71,7 @@ class Outcome:
 
 
 def run_yanks(meshes: int, seed: int, file: Path) -> Status:
-    """Load, cut and yank so many meshes, and print what happened to each.
+    """Load, cut and yank so many meshes, and print the result of each.
 
     Args:
         meshes: how many.

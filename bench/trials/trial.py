@@ -61,7 +61,7 @@ class Running:
 
 
 class Course:
-    """What is done to a running session."""
+    """Actions on a running session."""
 
     def tick(self, elapsed: float) -> bool | None:
         """Advance the course at a time [s]; return False at its end."""
