@@ -30,18 +30,20 @@ Looked for and not found:
 
 
 def page() -> str:
-    """Return the page."""
-    numbers = [
-        f'| `{name}` | `{key}` | {number.value:g} | {number.how} | {number.source} |'
-        for name, preset in PRESETS.items()
-        for key, number in preset.numbers.items()
-    ]
-    missing = [
-        f'| `{name}` | {", ".join(f"`{key}`" for key in preset.not_found)} |'
-        for name, preset in PRESETS.items()
-    ]
+    """Return the page; presets with the same number, or the same gaps, share a row."""
+    numbers: dict[str, list[str]] = {}
+    missing: dict[str, list[str]] = {}
+    for name, preset in PRESETS.items():
+        for key, n in preset.numbers.items():
+            row = f'`{key}` | {n.value:g} | {n.how} | {n.source} |'
+            numbers.setdefault(row, []).append(f'`{name}`')
+        missing.setdefault(', '.join(f'`{k}`' for k in preset.not_found), []).append(f'`{name}`')
     toughness = MaterialSettings.model_fields['toughness'].default
-    return _PAGE.format(toughness=toughness, numbers='\n'.join(numbers), missing='\n'.join(missing))
+    return _PAGE.format(toughness=toughness, numbers=_rows(numbers), missing=_rows(missing, ' |'))
+
+
+def _rows(presets: dict[str, list[str]], end: str = '') -> str:
+    return '\n'.join(f'| {", ".join(names)} | {row}{end}' for row, names in presets.items())
 
 
 if __name__ == '__main__':
