@@ -151,15 +151,6 @@ def last_cut(bag: Bag, number: int) -> int:
     )
 
 
-def read_frames(bag: Bag) -> list[FrameRecord]:
-    """Return the frames of a bag in their order, up to a restart of the simulation.
-
-    Raises:
-        BagError: the bag does not record the inputs of its frames.
-    """
-    return read_run(bag)[0]
-
-
 def read_run(bag: Bag, number: int = 0) -> tuple[list[FrameRecord], Restart | None]:
     """Return the frames of one process, and the restart after it; None: there is none.
 

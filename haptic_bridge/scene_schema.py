@@ -65,10 +65,6 @@ class Transform(SceneModel):
         """Map tissue positions [m], shape (..., 3), to the device frame."""
         return (np.asarray(positions) - self.translation) @ self.rotation() / self.scale
 
-    def force_to_device(self, forces: np.ndarray) -> np.ndarray:
-        """Rotate tissue forces [N], shape (..., 3), into the device frame, unscaled."""
-        return np.asarray(forces) @ self.rotation()
-
 
 class DeviceSettings(SceneModel):
     """Scene section `device`."""

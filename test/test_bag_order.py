@@ -15,7 +15,7 @@ from cutting_trainer.bags.comparison import Comparison, compare
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.bags.reader import Recorded, mcap_file, open_bag
-from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.recorded_frames import read_run
 from cutting_trainer.bags.recorder_node import Recorder
 from cutting_trainer.bags.resimulation_start import find_beginning
 from cutting_trainer.bags.steady_clock import SteadyClock
@@ -82,7 +82,7 @@ def test_a_clock_that_was_set_meanwhile_changes_nothing(
     times = {i: m.log_time + step for i, m in enumerate(messages) if i >= half}
     result = resimulated(written(made, tmp_path / 'bag', messages, times), tmp_path)
     assert result.identical and not result.missing and result.restart is None
-    assert result.frames == result.meshes == len(read_frames(open_bag(made)))
+    assert result.frames == result.meshes == len(read_run(open_bag(made))[0])
 
 
 def test_messages_that_are_there_twice_are_passed_over_and_counted(
@@ -91,7 +91,7 @@ def test_messages_that_are_there_twice_are_passed_over_and_counted(
     messages = [m for m in open_bag(made).messages() for _ in range(2)]
     folder = written(made, tmp_path / 'bag', messages)
     result = resimulated(folder, tmp_path)
-    frames = len(read_frames(open_bag(made)))
+    frames = len(read_run(open_bag(made))[0])
     assert result.identical and not result.missing and result.restart is None
     assert result.frames == frames
     assert result.doubled > frames

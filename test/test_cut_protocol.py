@@ -16,7 +16,7 @@ from cutting_trainer_msgs.srv import Cut
 from live import free_domain
 
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.recorded_frames import FrameRecord, read_frames
+from cutting_trainer.bags.recorded_frames import FrameRecord, read_run
 from cutting_trainer.bags.resimulation import Resimulation
 from cutting_trainer.cutting.combined import CombinedMethod
 from cutting_trainer.cutting.method_interface import FAILURES, SweepError, carry_out
@@ -170,7 +170,7 @@ def records(scene: Scene) -> list[FrameRecord]:
     The bag was recorded with an earlier law of the blade: it cut elsewhere, and nodes that came
     with its cuts may not be there.
     """
-    every = read_frames(open_bag(CUT))
+    every = read_run(open_bag(CUT))[0]
     first = next(i for i, record in enumerate(every) if record.has_contact)
     last = recomputation(scene).simulation.mesh.node_count - 1
     for record in every[first:]:

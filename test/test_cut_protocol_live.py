@@ -18,7 +18,7 @@ from live import free_domain, node_words, running, wait_for
 from rclpy.executors import SingleThreadedExecutor
 
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.recorded_frames import read_run
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation
@@ -113,7 +113,7 @@ def session(tmp_path: Path) -> Iterator[tuple[Between, Path, Any]]:
 def play(between: Between, until: Any = lambda: False) -> dict[int, Contact]:
     """Plays the recorded contacts, at their pace by frames; those that were sent, by number."""
     sent = {}
-    for number, record in enumerate(read_frames(open_bag(CUT)), 1):
+    for number, record in enumerate(read_run(open_bag(CUT))[0], 1):
         if record.contact is None:
             continue
         message = Contact()

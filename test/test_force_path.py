@@ -333,12 +333,11 @@ def test_a_change_of_connectivity_voids_the_line_of_the_older_sample():
     np.testing.assert_allclose(rig.run(np.full(10, RADIUS - 8e-3)), [at] * 10)
 
 
-def test_device_frame_maps_positions_in_and_forces_out():
+def test_device_frame_maps_positions_in_and_back():
     turn = Transform(translation=(0.1, 0.2, 0.3), rotation_rpy_deg=(0, 90, 0), scale=2.0)
     p = np.array([0.01, -0.02, 0.03])
     np.testing.assert_allclose(turn.to_tissue(p), [0.1 + 0.06, 0.2 - 0.04, 0.3 - 0.02])
     np.testing.assert_allclose(turn.to_device(turn.to_tissue(p)), p)
-    np.testing.assert_allclose(turn.force_to_device(np.array([0, 0, 1.0])), [-1, 0, 0], atol=1e-12)
 
 
 def test_a_rotated_device_feels_the_same_force_along_its_own_axis():

@@ -31,7 +31,7 @@ from rosbags.highlevel import AnyReader
 from cutting_trainer.bags.comparison import compare
 from cutting_trainer.bags.metadata import read_metadata, recorded_code
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.recorded_frames import read_run
 from cutting_trainer.bags.topic_names import CUTS, DIAGNOSTICS
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import (
@@ -313,7 +313,7 @@ def test_one_pose_changed_in_the_bag_of_a_live_session_is_caught_at_its_frame(
     session: LiveSession, recording: Recording, tmp_path: Path
 ) -> None:
     bag = recording.bag
-    records = [record for record in read_frames(bag) if record.has_contact]
+    records = [record for record in read_run(bag)[0] if record.has_contact]
     changed = records[len(records) // 2]
     assert changed.pose is not None
     rewritten(session.bag, tmp_path / 'bag', moved_by(1e-7, changed.pose.stamp_ns))

@@ -13,7 +13,7 @@ from made_session import PERIOD, make_session, watched
 
 from cutting_trainer.bags.comparison import Comparison, compare
 from cutting_trainer.bags.reader import Recorded, open_bag
-from cutting_trainer.bags.recorded_frames import contact_message, read_frames
+from cutting_trainer.bags.recorded_frames import contact_message, read_run
 from cutting_trainer.bags.resimulation import Resimulation
 from cutting_trainer.bags.resimulation_start import find_beginning
 from cutting_trainer.bags.topic_names import FORCE, MEMORY, POSE, STATE
@@ -174,7 +174,7 @@ def test_a_bag_that_begins_in_a_stroke_is_computed_again_from_the_state_in_it(
     late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     result = compared(late, tmp_path)
-    steps = [record.step for record in read_frames(open_bag(late))]
+    steps = [record.step for record in read_run(open_bag(late))[0]]
     assert result.identical and result.begins % STATE_EVERY == 0
     assert 1 < steps[0] <= result.begins < steps[0] + STATE_EVERY
     assert result.frames == result.forces == steps[-1] - result.begins + 1
@@ -214,7 +214,7 @@ def test_both_sides_of_the_table_begin_after_the_frame_before_the_state(
 
     bag = open_bag(rewritten(late, tmp_path / 'bag', without_first_state))
     scene, beginning = load_scene(str(restore_scene(bag, tmp_path))), find_beginning(bag)
-    records = read_frames(bag)
+    records = read_run(bag)[0]
     before = next(r.pose for r in records if r.step == beginning.step - 1)
     assert before is not None and records[-1].pose is not None
     stamps = [codec.decode(m.data).stamp_ns for m in bag.messages([POSE])]
@@ -260,7 +260,7 @@ def test_a_bag_without_a_state_says_from_where_it_would_be_and_is_reported_never
 ) -> None:
     bare = rewritten(late, tmp_path / 'bare', lambda m: None if m.topic == STATE else m.data)
     assert cli_status('resimulate', str(bare)) == 2
-    first = read_frames(open_bag(late))[0].step
+    first = read_run(open_bag(late))[0][0].step
     assert f'begins at frame {first}, and ' in capsys.readouterr().err.replace('\n', ' ')
     assert cli_status('report', str(bare), '-o', str(tmp_path / 'report.html')) == 0
 

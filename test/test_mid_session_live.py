@@ -14,7 +14,7 @@ from live import PATIENCE, ROOT, LiveSession, free_domain, onlooker, wait_for
 from ruamel.yaml import YAML
 
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.recorded_frames import read_run
 from cutting_trainer.bags.resimulation_start import find_beginning
 from cutting_trainer.bags.topic_names import INPUTS
 from cutting_trainer.cli import main as cli
@@ -92,7 +92,7 @@ def test_a_bag_that_was_begun_in_a_stroke_is_computed_again_bit_for_bit(
     opened = open_bag(bag)
     beginning = find_beginning(opened)
     assert beginning.tissue is not None and beginning.cutting is not None
-    records = {record.step: record for record in read_frames(opened)}
+    records = {record.step: record for record in read_run(opened)[0]}
     before = records[beginning.step - 1].force
     assert before is not None
     assert before.values[ForceSampleCodec.fields['state']][0] == ContactState.INSIDE

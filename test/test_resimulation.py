@@ -18,7 +18,7 @@ from cutting_trainer.bags.comparison import MAX_ROUNDING, Comparison, compare
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.message_class import message_class
 from cutting_trainer.bags.reader import Recorded, open_bag
-from cutting_trainer.bags.recorded_frames import read_frames
+from cutting_trainer.bags.recorded_frames import read_run
 from cutting_trainer.bags.repair import copy_bag
 from cutting_trainer.bags.resimulation import answer_frames, as_recorded
 from cutting_trainer.bags.topic_names import (
@@ -82,7 +82,7 @@ def test_a_session_with_cuts_is_computed_again_bit_for_bit(made: Path, tmp_path:
     result = resimulated(made, tmp_path)
     assert result.identical
     assert not result.missing
-    assert result.frames == result.forces == result.meshes == len(read_frames(open_bag(made)))
+    assert result.frames == result.forces == result.meshes == len(read_run(open_bag(made))[0])
     assert result.hashes > 5
     bag = open_bag(made)
     assert sum(bag.read(m).cut_step > 0 for m in bag.messages([UPDATES])) > 3
@@ -347,7 +347,7 @@ def test_cuts_of_a_changed_session_are_answered_by_the_protocol_of_its_bag(made:
     old = [{}, {'step': 12, 'cut_step': 10}, {'step': 25, 'cut_step': 20}]
     frames = answer_frames([SimpleNamespace(**answer | record) for record in old])
     assert [frames(step) for step in (5, 10, 19, 20, 99)] == [2, 2, 2, 5, 5]
-    assert answer_frames(read_frames(open_bag(made)))(7) == 1
+    assert answer_frames(read_run(open_bag(made))[0])(7) == 1
     fixed = [SimpleNamespace(**answer | record | {'answer_frames': 2}) for record in old]
     assert answer_frames(fixed)(20) == 2
 
@@ -384,7 +384,7 @@ def test_what_another_processor_rounds_is_told_and_what_is_more_differs(
         assert result.difference is not None and result.difference.step == frame.step
         assert said[0].startswith('differs first')
         return
-    assert result.difference is None and result.frames == len(read_frames(open_bag(made)))
+    assert result.difference is None and result.frames == len(read_run(open_bag(made))[0])
     assert result.rounding is not None and result.rounding.step == frame.step
     assert result.largest == pytest.approx(share, rel=0.01)
     assert said[0] == 'not identical: off by no more than 1e-13 of the recorded values'
@@ -431,7 +431,7 @@ def test_a_frame_that_the_bag_lacks_ends_every_computation_in_one_sentence(
             view_bag_command.resimulated(bag, scene, Console(quiet=True), changed=changed)
     with pytest.raises(BagError, match=lacks):
         recorded_run(bag, recomputation(scene))
-    left = [record for record in read_frames(source) if record.step != gone.step]
+    left = [record for record in read_run(source)[0] if record.step != gone.step]
     with pytest.raises(BagError, match=lacks):
         list(as_recorded(left, recomputation(scene)))
 
