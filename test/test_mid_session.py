@@ -107,26 +107,37 @@ def going_on(
 @pytest.mark.parametrize(
     'changes',
     [
-        {},
-        {'tissue.integrator': 'implicit', 'tissue.model': 'corotational'},
-        {'tissue.active_region.mode': 'on', 'tissue.model': 'linear_smoothed'},
-        {'tissue.active_region': '{mode: budget, nodes: 60}', 'cutting.method': 'subdivide'},
-        {'tissue.model': 'corotational_smoothed', 'cutting.method': 'delete'},
-        {'tissue.model': 'stiffening', 'tissue.material.stiffening': '6'},
-        {'tissue.model': 'stiffening', 'tissue.active_region.mode': 'on'},
-        VISCOUS | {'tissue.model': 'linear', 'tissue.active_region.mode': 'on'},
-        VISCOUS | {'tissue.model': 'stiffening', 'tissue.material.stiffening': '6'},
-    ],
-    ids=[
-        'as-recorded',
-        'implicit',
-        'active',
-        'budget',
-        'smoothed',
-        'law',
-        'law-active',
-        'viscous-active',
-        'viscous-law',
+        pytest.param({}, id='as-recorded'),
+        pytest.param(
+            {'tissue.integrator': 'implicit', 'tissue.model': 'corotational'}, id='implicit'
+        ),
+        pytest.param(
+            {'tissue.active_region.mode': 'on', 'tissue.model': 'linear_smoothed'}, id='active'
+        ),
+        pytest.param(
+            {'tissue.active_region': '{mode: budget, nodes: 60}', 'cutting.method': 'subdivide'},
+            id='budget',
+        ),
+        pytest.param(
+            {'tissue.model': 'corotational_smoothed', 'cutting.method': 'delete'}, id='smoothed'
+        ),
+        pytest.param(
+            {'tissue.model': 'stiffening', 'tissue.material.stiffening': '6'},
+            id='law',
+            marks=pytest.mark.thorough,
+        ),
+        pytest.param(
+            {'tissue.model': 'stiffening', 'tissue.active_region.mode': 'on'}, id='law-active'
+        ),
+        pytest.param(
+            VISCOUS | {'tissue.model': 'linear', 'tissue.active_region.mode': 'on'},
+            id='viscous-active',
+        ),
+        pytest.param(
+            VISCOUS | {'tissue.model': 'stiffening', 'tissue.material.stiffening': '6'},
+            id='viscous-law',
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_frames_go_on_from_the_state_of_any_frame_with_the_same_bits(
