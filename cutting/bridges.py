@@ -143,7 +143,7 @@ def _alone(middle, normal, way, h):
         h: length of an edge [m].
     """
     alone = np.ones(len(way), np.bool_)
-    far, near = 1.5 * np.pi * _TUBE * h, 2 * _TUBE * h
+    far, near = 1.5 * np.pi * _TUBE * h, 3 * _TUBE * h  # two tubes, and an element
     for k in range(len(way)):
         for j in range(k):
             if way[k] - way[j] <= far:
