@@ -7,9 +7,14 @@ import pytest
 from meshes import irregular_box
 from strokes import draw, method_named, straight
 
+from bench.cuts.loose_pieces import counted
+from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.contact.tool import ContactState
+from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister, free_parts, pieces_of
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
 from cutting_trainer.tissue_sim.node import TissueSimNode
 
 SIZE = np.array([0.06, 0.06, 0.012])
@@ -110,3 +115,46 @@ def test_a_cut_may_take_nodes_back():
     assert used == len(mesh.rest)
     assert register.find_new(longer, longer.rest) == []
     assert register.find_new(mesh, mesh.rest) == []
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_pieces_and_volumes_are_those_of_the_closed_surfaces(seed):
+    rng = np.random.default_rng(seed)
+    mesh = held_at_its_sides()
+    register = PieceRegister(mesh)
+    excise(mesh, rng.uniform(-0.008, 0.008, 2), rng.uniform(0.008, 0.011), rng.uniform(0, np.pi))
+    told = sorted(piece.volume for piece in register.find_new(mesh, mesh.rest))
+    assert told == pytest.approx(sorted(counted(mesh).values()), rel=1e-9)
+
+
+def pushed_plug(gravity=(0.0, 0.0, 0.0)):
+    """Hardly damped tissue, and the nodes of a plug in it that was pushed at 0.2 m/s."""
+    mesh = held_at_its_sides()
+    excise(mesh, (0.0, 0.0), 0.01, 0.3)
+    material = Material(2000.0, 0.3, 1060.0, 0.1, 2e-4)
+    stepping = TimeStepping('symplectic_euler', max_substeps=10000)
+    dynamics = Dynamics(mesh, material, 'linear', stepping, ActiveSettings('on'), gravity)
+    dynamics.resume(np.zeros_like(mesh.rest))
+    loose = free_parts(mesh) > 0
+    dynamics.velocity[loose] = [0.2, 0.0, 0.0]
+    dynamics.restart()
+    return dynamics, loose
+
+
+def test_a_loose_piece_comes_to_rest_within_two_seconds_and_costs_nothing_then():
+    dynamics, loose = pushed_plug()
+    for _ in range(60):
+        dynamics.advance(Coupling())
+    assert not dynamics.velocity.any()
+    assert dynamics.active_nodes == 0
+    assert 0.005 < dynamics.displacement[loose, 0].mean() < 0.03
+    assert np.abs(dynamics.displacement[~loose]).max() < 1e-6
+
+
+def test_a_loose_piece_falls_under_its_weight():
+    dynamics, loose = pushed_plug(gravity=(0.0, 0.0, -9.81))
+    dynamics.velocity[:] = 0.0
+    dynamics.restart()
+    for _ in range(3):
+        dynamics.advance(Coupling())
+    assert dynamics.displacement[loose, 2].mean() == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.03)

@@ -10,6 +10,7 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.adjacency import spans_of
 from cutting_trainer.tissue_sim.mesh.checks import EDGES, components
+from cutting_trainer.tissue_sim.mesh.pieces import free_parts
 from cutting_trainer.tissue_sim.mesh.strain import Strain
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import (
     TetMesh,
@@ -39,6 +40,9 @@ _FINER, _FINEST = 4, 16
 without rotations, no more than 5: its bound holds in any shape, and steps shorter than a quarter do
 not help."""
 _CAUTIOUS_FRAMES = 30
+_DRAG = 10.0
+"""Damping of loose pieces in proportion to mass, beside the tissue's own [1/s]: wet tissue sticks
+to its bed, which is not simulated, within centimetres."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,7 @@ class Dynamics:
         self.material = material
         self.model = ElasticModel(mesh, material, model)
         loaded = bool(material.prony) or any(gravity)
+        self._falls = any(gravity)
         self.loads = Loads(self.model, gravity) if loaded else None
         self.stepping = stepping or TimeStepping()
         self._frame_time = 1.0 / self.stepping.rate
@@ -133,6 +138,7 @@ class Dynamics:
         self._still = 0
         self._elastic = ElasticState(self.model)
         self._touched: list[np.ndarray] = []
+        self._loose: np.ndarray | None = np.zeros(0, np.int64)  # None: not known since a cut
         self._caution = 1
         self._cautious = 0
         self._detector = DivergenceDetector(mesh, material.youngs_modulus)
@@ -242,8 +248,8 @@ class Dynamics:
     def advance(self, coupling: Coupling, tool: Tool | None = None) -> FrameMotion:
         """Integrate a frame; after divergence, retry it with shorter steps.
 
-        An unattached piece may be pushed away without end. It stops at a distance of the tissue's
-        length.
+        A loose piece comes to rest, or falls where there is weight; pushed away, it stops at a
+        distance of the tissue's length.
 
         Args:
             coupling: the tool's spring.
@@ -261,6 +267,7 @@ class Dynamics:
             flat = self._u[: 3 * self.mesh.node_count]
             self._stiffened.begin(flat, self._frequency.omega, self.inverse_mass)
         substeps, dt = self._substeps(coupling)
+        self._hold_back(tool is None and coupling.mode == FREE)
         before = (self._u.copy(), self._v.copy())
         relieved = None if self.loads is None else self.loads.kept()
         trouble = ''
@@ -291,6 +298,16 @@ class Dynamics:
         force, elastic = self._elastic.whole(self.displacement)
         self._detector.open(elastic + self._load_energy())
         return FrameMotion(np.zeros_like(force), 0.0, 0.0, substeps, 0.0, trouble, diverged=True)
+
+    def _hold_back(self, free: bool) -> None:
+        """Slow the loose pieces, which are looked for after a cut when no tool is in the tissue."""
+        if self._falls:
+            return
+        if self._loose is None and free:
+            held = self.mesh.fixed.any()
+            self._loose = np.flatnonzero(free_parts(self.mesh)) if held else np.zeros(0, np.int64)
+        if self._loose is not None and len(self._loose):
+            self.velocity[self._loose] *= np.exp(-_DRAG * self._frame_time)
 
     def _hold_lost(self, u: np.ndarray, v: np.ndarray) -> bool:
         """Return to the start of the frame, with lost pieces held in their shapes at rest.
@@ -435,7 +452,7 @@ class Dynamics:
         Raises:
             MeshError: the change does not fit the mesh.
         """
-        self._still = 0
+        self._still, self._loose = 0, None
         n, total = self.mesh.node_count, self.mesh.node_count + len(delta.node_parents)
         touched = self.mesh.apply(delta)
         self._u, self._v = grown(self._u, 3 * total), grown(self._v, 3 * total)
@@ -455,6 +472,7 @@ class Dynamics:
         """
         self.displacement[:] = displacement
         self.velocity[:] = 0.0
+        self._loose = None
         if self.loads is not None:
             self.loads.relax(self._u[: 3 * self.mesh.node_count])
         self.restart()

@@ -136,6 +136,8 @@ def check_simulation(simulation: TissueSimulation) -> None:
     for name in ('_u', '_v', '_inverse'):
         has_room(name, getattr(dynamics, name), 3 * n)
     has_room('_inertia', dynamics._inertia, n)
+    if dynamics._loose is not None:
+        within('_loose', dynamics._loose, n)
     _check_loads(dynamics, n)
     if dynamics._stiffened is not None:
         has_room('_linear', dynamics._stiffened._linear, n)
