@@ -120,16 +120,21 @@ def cap(organ: Organ, rng: np.random.Generator) -> Cut:
     return Cut((path,), inside=at * normal)
 
 
+def _upward(cut: Cut) -> Floats:
+    """Return the unit normal of a flat cut, shape (3,)."""
+    a, b, c = cut.paths[0][0, 0], cut.paths[0][0, 1], cut.paths[0][-1, 0]
+    normal: Floats = np.cross(b - a, c - a)
+    return normal * math.copysign(1.0, normal[2]) / np.linalg.norm(normal)
+
+
 def volume_of(organ: Organ, cut: Cut, name: str) -> float:
     """Return the volume that a cut's shape takes from a mesh [m^3]; NaN: not known."""
     if name == 'cap':
         mesh = TetMesh(organ.nodes, organ.tetrahedra)
         surface = trimesh.Trimesh(mesh.rest, mesh.triangles, process=False)
-        a, b, c = cut.paths[0][0, 0], cut.paths[0][0, 1], cut.paths[0][-1, 0]
-        normal = np.cross(b - a, c - a)
-        normal *= math.copysign(1.0, normal[2])
+        a = cut.paths[0][0, 0]
         nodes, faces, _ = trimesh.intersections.slice_faces_plane(
-            surface.vertices, surface.faces, normal / np.linalg.norm(normal), a
+            surface.vertices, surface.faces, _upward(cut), a
         )
         # Seen from a point of the plane, the missing face of the cut has no volume.
         return float(np.linalg.det(nodes[faces] - a).sum()) / 6
@@ -147,18 +152,19 @@ CUTS: dict[str, Callable[[Organ, np.random.Generator], Cut]] = {
 }
 
 
-def simulation_of(organ: Organ, scene: str, cut: str) -> TissueSimulation:
+def simulation_of(organ: Organ, scene: str, cut: Cut, name: str) -> TissueSimulation:
     """Return a mesh as tissue of a shipped scene, held where the cut does not go."""
     tissue = load_scene(scene).tissue
     m, d, i = tissue.material, tissue.damping, tissue.integration
     material = Material(
         m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta, m.stiffening, m.prony
     )
-    low, high = organ.nodes.min(axis=0), organ.nodes.max(axis=0)
-    if cut == 'cap':
-        fixed = organ.nodes[:, 2] < low[2] + 0.1 * (high - low)[2]
+    if name == 'cap':
+        height = organ.nodes @ _upward(cut)
+        fixed = height < np.quantile(height, 0.2)
     else:
-        fixed = (np.abs(organ.nodes - (low + high) / 2) > 0.46 * (high - low))[:, :2].any(axis=1)
+        away = np.linalg.norm((organ.nodes - cut.inside)[:, :2], axis=1)
+        fixed = away > min(cut.beyond + 0.5 * organ.h, float(np.quantile(away, 0.99)))
     return TissueSimulation(
         TetMesh(organ.nodes.copy(), organ.tetrahedra.copy(), fixed.astype(np.uint8)),
         material,
@@ -190,7 +196,7 @@ def take_out(organ: Organ, name: str, scene: str, seed: int) -> Outcome:
     """Cut a piece out of a mesh, push it away, and follow it for two seconds."""
     rng = np.random.default_rng(seed)
     cut = CUTS[name](organ, rng)
-    simulation = simulation_of(organ, scene, name)
+    simulation = simulation_of(organ, scene, cut, name)
     mesh = simulation.mesh
     register = PieceRegister(mesh)
     cutter = make_method(CuttingSettings())
