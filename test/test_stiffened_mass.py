@@ -45,8 +45,9 @@ def test_no_tangent_is_faster_than_the_step_allows(kind: str, nu: float, stiffen
     flat = shape(dynamics.mesh.rest, kind).ravel()
     stiffened = dynamics._stiffened
     assert stiffened is not None
-    stiffened.begin(flat, dynamics._frequency.omega, dynamics.inverse_mass)
-    inverse = stiffened.adapt(flat, np.zeros_like(flat), dynamics.inverse_mass)
+    whole = dynamics.model.operands()
+    stiffened.begin(flat, dynamics._frequency.omega, dynamics.inverse_mass, whole)
+    inverse = stiffened.adapt(flat, np.zeros_like(flat), dynamics.inverse_mass, whole)
     n, step = len(flat), 1e-9
     tangent = np.empty((n, n))
     for i in range(n):
@@ -92,16 +93,17 @@ def test_a_node_that_becomes_heavier_keeps_its_momentum_and_a_lighter_one_its_ve
     assert stiffened is not None
     strained = shape(dynamics.mesh.rest, 'pressed').ravel()
     v = np.repeat(np.where(dynamics.mesh.fixed == 1, 0.0, 0.1), 3)
-    stiffened.begin(strained, dynamics._frequency.omega, dynamics.inverse_mass)
-    rest = stiffened.adapt(np.zeros(3 * n), v, dynamics.inverse_mass).copy()
+    whole = dynamics.model.operands()
+    stiffened.begin(strained, dynamics._frequency.omega, dynamics.inverse_mass, whole)
+    rest = stiffened.adapt(np.zeros(3 * n), v, dynamics.inverse_mass, whole).copy()
     np.testing.assert_array_equal(rest, dynamics.inverse_mass)
     before = v.copy()
-    heavy = stiffened.adapt(strained, v, dynamics.inverse_mass)
+    heavy = stiffened.adapt(strained, v, dynamics.inverse_mass, whole)
     assert stiffened.strain.heavier > 0 and stiffened.strain.added > 0
     free = rest > 0
     np.testing.assert_allclose(v[free] / heavy[free], before[free] / rest[free], rtol=1e-12)
     slow = v.copy()
-    stiffened.adapt(np.zeros(3 * n), v, dynamics.inverse_mass)
+    stiffened.adapt(np.zeros(3 * n), v, dynamics.inverse_mass, whole)
     np.testing.assert_array_equal(v, slow)
     assert stiffened.strain.heavier == 0
 

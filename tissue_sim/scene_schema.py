@@ -214,11 +214,14 @@ class ActiveRegionSettings(SceneModel):
 
     mode: Literal['off', 'on', 'budget'] = Field(
         default='off',
-        description='off: all nodes move; on: those that forces or neighbours move; budget: of '
-        'those the nodes nearest to the tool',
+        description='off: all nodes move; on: those that forces or neighbours move; budget: the '
+        'nodes nearest to the tool, and all others by a coarse grid',
     )
     nodes: int = Field(
-        default=2000, ge=1, le=10**7, description='how many move at most with budget [-], 1 to 1e7'
+        default=2000,
+        ge=1,
+        le=10**7,
+        description='how many move on their own with budget [-], 1 to 1e7',
     )
     tolerance: float = Field(
         default=1e-4,

@@ -10,7 +10,7 @@ from itertools import permutations
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.blade import Resistance
-from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact
 from cutting_trainer.tissue_sim.elasticity.compliance import PointCompliance
 from cutting_trainer.tissue_sim.elasticity.material import Material
@@ -93,14 +93,18 @@ def warm_up_frames(integrator: IntegratorName) -> None:
 def warm_up_models() -> None:
     """Move a cube with every model. Only the first call does anything."""
     region, stepping = ActiveSettings('budget', 6), TimeStepping('symplectic_euler')
+    top = np.full(3, 0.01)
+    touching = Coupling(PUSH, np.array([7]), np.ones(1), top, top, stiffness=1.0)
     for model in MODELS:
-        Dynamics(small_cube(), _MATERIAL, model, stepping, region).advance(Coupling())
+        cube = Dynamics(small_cube(), _MATERIAL, model, stepping, region)
+        for coupling in (Coupling(), touching, Coupling()):
+            cube.advance(coupling)
     viscous = replace(_MATERIAL, prony=((0.5, 1.0),))
     Dynamics(small_cube(), viscous, 'stiffening', stepping).advance(Coupling())
     # Further kernels, for a large tissue or one after many cuts.
     tissue, n = ElasticModel(small_cube(), _MATERIAL, 'linear'), 8
-    some, free = np.arange(n - 1), np.ones(3 * n, bool)
-    PointCompliance().estimate(tissue, free, some[-1:], np.ones(1), np.eye(3), some)
+    nodes, free = np.array([1]), np.ones(3 * n, bool)
+    PointCompliance(most=4).estimate(tissue, free, nodes, np.ones(1), np.eye(3))
     rows = TensorMass(tissue.mesh, 1.0, 1.0).tensors
     packed(rows.start, rows.used, rows.room, n, rows.columns, rows.blocks, np.array([1 << 20]))
 

@@ -325,11 +325,11 @@ def _flush_rows(law, domains, waiting, chunk, rows, strain):
 
 
 @kernel(error_model='numpy')
-def add_tangent_rows(law, domains, elements, chunks, u, rows, strain):
+def add_tangent_rows(law, domains, elements, awake, chunks, u, rows, strain):
     """Add to bounds of row sums what the tangent has more than the linear stiffness.
 
     Args:
-        law, domains, elements, chunks, u: see `add_law_forces`.
+        law, domains, elements, awake, chunks, u: see `add_law_forces`.
         rows: added to [N/m], shape (n,).
         strain: output: number of domains and of elements beyond the tolerance, least and largest J
             of these domains, their least and largest principal stretch, shape (6,).
@@ -338,20 +338,21 @@ def add_tangent_rows(law, domains, elements, chunks, u, rows, strain):
     least, count, n = law.tolerance[0] ** 2, 0, domains.used.shape[0]
     strain[0] = strain[1] = 0.0
     strain[2:] = 1.0
-    for i in range(n):
-        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = smoothed_gradient(domains, u, i)
-        square = xx * xx + xy * xy + xz * xz + yx * yx + yy * yy + yz * yz
-        square += zx * zx + zy * zy + zz * zz
-        if square < least:
-            continue
-        lane = chunk[count::LANES]
-        lane[0], lane[1], lane[2], lane[3], lane[4] = xx, xy, xz, yx, yy
-        lane[5], lane[6], lane[7], lane[8] = yz, zx, zy, zz
-        waiting[count] = i
-        count += 1
-        if count == LANES:
-            _flush_rows(law, domains, waiting, chunk, rows, strain)
-            count = 0
+    for s in range(awake.shape[0]):
+        for i in range(awake[s, 0], min(n, awake[s, 1])):
+            (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = smoothed_gradient(domains, u, i)
+            square = xx * xx + xy * xy + xz * xz + yx * yx + yy * yy + yz * yz
+            square += zx * zx + zy * zy + zz * zz
+            if square < least:
+                continue
+            lane = chunk[count::LANES]
+            lane[0], lane[1], lane[2], lane[3], lane[4] = xx, xy, xz, yx, yy
+            lane[5], lane[6], lane[7], lane[8] = yz, zx, zy, zz
+            waiting[count] = i
+            count += 1
+            if count == LANES:
+                _flush_rows(law, domains, waiting, chunk, rows, strain)
+                count = 0
     _flush_rows(law, domains, waiting[:count], chunk, rows, strain)
     count = groups_beyond(elements, chunks, u, law.tolerance[1], law.candidates)
     groups = law.candidates[:count]

@@ -147,13 +147,15 @@ class PointCompliance:
         steps: conjugate-gradient steps per call and direction. In a large tissue, where the
             solution survives cuts, and with a law there are at most twice as many for all
             directions.
+        most: nodes that yield in a large tissue.
 
     Attributes:
         calls: since the last change of connectivity or number of directions.
     """
 
-    def __init__(self, steps: int = 12) -> None:
+    def __init__(self, steps: int = 12, most: int = PATCH) -> None:
         self.calls = 0
+        self._most = most
         self._steps = steps
         self._x = np.zeros((0, 0))
         self._held = np.zeros((0, 0))
@@ -167,7 +169,6 @@ class PointCompliance:
         nodes: np.ndarray,
         weights: np.ndarray,
         axes: np.ndarray,
-        moving: np.ndarray | None = None,
     ) -> np.ndarray:
         """Refine and return the compliance.
 
@@ -176,7 +177,6 @@ class PointCompliance:
             free: True where a coordinate can move, shape (3 n,).
             nodes, weights: that share the force, each once, shape (c,).
             axes: unit vectors, square to each other, along which forces act, shape (d, 3).
-            moving: nodes that yield, if others are held, shape (a,).
 
         Returns:
             Displacement along axis i for 1 N along axis j [m/N], positive semidefinite,
@@ -189,10 +189,7 @@ class PointCompliance:
             self._topology = model.mesh.topology
             self.calls = 0
         self.calls += 1
-        if moving is not None:
-            patch = np.union1d(moving, nodes)
-        else:
-            patch = model.neighbours.around(nodes, 0, PATCH) if n > PATCH else np.arange(n)
+        patch = model.neighbours.around(nodes, 0, self._most) if n > self._most else np.arange(n)
         operands = model.operands(patch if len(patch) < n else None)
         at = (3 * patch[:, None] + np.arange(3)).ravel()
         left = without(self._patch, patch)
@@ -226,7 +223,7 @@ class PointCompliance:
 
     def _begin(self, axes: int, n: int) -> None:
         """Allocate directions and nodes; a large tissue keeps its solution."""
-        if n <= PATCH or len(self._x) != axes:
+        if n <= self._most or len(self._x) != axes:
             self._x, self._held = np.zeros((axes, 3 * n)), np.zeros((5, 3 * n))
             self._patch = np.zeros(0, np.int64)
         elif self._x.shape[1] < 3 * n:

@@ -22,6 +22,12 @@ from cutting_trainer.tissue_sim.elasticity.adaptive_law import (
     add_law_bounds,
     add_law_forces,
 )
+from cutting_trainer.tissue_sim.elasticity.coarse_rows import (
+    NO_COARSE_ROWS,
+    CoarseRows,
+    lead_far_nodes,
+    put_coarse_forces,
+)
 from cutting_trainer.tissue_sim.elasticity.corotational import (
     CorotationalElements,
     Elements,
@@ -90,6 +96,7 @@ class Operands(NamedTuple):
         local: complete rows of a part with its own numbering of u and f, or none.
         law: of domains and elements, instead of corotation, or none.
         load: forces to subtract from the elastic ones [N], by coordinate; (0,): none.
+        coarse: unknowns after the nodes that move far nodes, or none.
     """
 
     rows: StiffnessRows
@@ -102,6 +109,7 @@ class Operands(NamedTuple):
     local: LocalRows
     law: Law
     load: np.ndarray
+    coarse: CoarseRows
 
 
 class ModelPart(NamedTuple):
@@ -142,9 +150,11 @@ def internal_force(operands, u, f, rotation_steps):
         Elastic energy of domains and elements [J]; with a law, that of all if rotation_steps is
         negative.
     """
+    lead_far_nodes(operands.coarse, u, 1.0)
     energy = _elastic_force(operands, u, f, rotation_steps)
     if operands.load.shape[0] > 0:
         _subtract(operands.load, operands.reach, f)
+    put_coarse_forces(operands.coarse, u, f, 1.0)
     return energy
 
 
@@ -185,6 +195,13 @@ def stiffness_product(operands, x, f):
         x: by coordinate, shape (3 n,).
         f: output, shape (3 n,).
     """
+    lead_far_nodes(operands.coarse, x, 0.0)
+    _stiffness_product(operands, x, f)
+    put_coarse_forces(operands.coarse, x, f, 0.0)
+
+
+@inner(error_model='numpy')
+def _stiffness_product(operands, x, f):
     _begin(operands, x, f)
     if operands.law.domains.shape[0] > 0:
         add_linear_smoothed_forces(operands.domains, operands.awake, x, f)
@@ -467,6 +484,7 @@ class ElasticModel:
             NO_LOCAL_ROWS,
             self._law_operands(chunks),
             self.load,
+            NO_COARSE_ROWS,
         )
 
     def part(self, nodes: np.ndarray, around: np.ndarray, others: np.ndarray) -> ModelPart | None:
@@ -482,7 +500,7 @@ class ElasticModel:
         none = np.zeros(0, np.int64)
         operands = Operands(
             _NO_ROWS, _NO_DOMAINS, _NO_ELEMENTS, 0, own, all_of_them, none, place.rows, NO_LAW,
-            _NO_LOAD,
+            _NO_LOAD, NO_COARSE_ROWS,
         )  # fmt: skip
         return ModelPart(place, operands)
 

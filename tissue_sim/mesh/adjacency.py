@@ -87,6 +87,11 @@ class NodeAdjacency:
             size = int(self._filled[0]) + 16 * len(left) + 4096
             self._rows = self._rows._replace(columns=grown(self._rows.columns, size))
 
+    @property
+    def rows(self) -> AdjacencyRows:
+        """The rows of the present nodes, the node itself among its neighbours."""
+        return self._rows
+
     def levels(self, nodes: np.ndarray, rings: int, least: int = 0) -> np.ndarray:
         """Return the distance of all nodes from some, in edges, up to `rings`, shape (n,).
 

@@ -12,17 +12,17 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling
+from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.local_rows import Locality
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, internal_force
 from cutting_trainer.tissue_sim.mesh.adjacency import intervals, without
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import Touched, grown
 
 _BLOCK = 4
 """Substeps between two selections while some nodes sleep and no cut has shortened the substeps."""
 _BLOCK_AWAKE, _CHOICES_AWAKE = 16, 3
-"""If no node sleeps, or the budget is used up, a new selection would change little: smallest number
-of substeps between two, and largest number per frame. A selection costs about four substeps."""
+"""If no node sleeps, a new selection would change little: smallest number of substeps between two,
+and largest number per frame. A selection costs about four substeps."""
 _LEVELS_AROUND_MOVING = 2
 """Distance, in edges, of the neighbours that a moving node keeps awake."""
 _CHOICES_TO_SLEEP = 6
@@ -34,8 +34,9 @@ class ActiveSettings:
     """Selection of the active region.
 
     Attributes:
-        mode: off (all nodes move), on, or budget (at most `nodes`, the nearest to the tool).
-        nodes: largest number of nodes with `budget`.
+        mode: off (all nodes move), on, or budget (`nodes` move on their own, the nearest to the
+            tool, and all others by a coarse grid, see `FarField`).
+        nodes: number of nodes with `budget`.
         tolerance: speed [m/s] below which a node may sleep.
     """
 
@@ -94,6 +95,9 @@ class ActiveRegion:
         implicit: whether steps are long and involve more than the next neighbours.
     """
 
+    extra = 0
+    """Coordinates beside those of the nodes, see `FarField`."""
+
     def __init__(self, model: ElasticModel, settings: ActiveSettings, *, implicit: bool) -> None:
         self._model = model
         self._settings = settings
@@ -124,13 +128,7 @@ class ActiveRegion:
     @property
     def whole(self) -> bool:
         """Whether all nodes move unconditionally."""
-        return self._settings.mode == 'off'
-
-    @property
-    def held_to(self) -> np.ndarray | None:
-        """Moving nodes if a budget holds all others against any force; else None."""
-        full = self._settings.mode == 'budget' and self.count >= self._settings.nodes
-        return self._awake if full else None
+        return self._settings.mode != 'on'
 
     def moved(self) -> np.ndarray:
         """Return the nodes moved since the last call, sorted, shape (a,)."""
@@ -148,14 +146,11 @@ class ActiveRegion:
             left, total: substeps that the frame still has, and has in all.
             shortened: ratio of the substep's length before any cut to its present length.
         """
-        if self._settings.mode == 'off':
+        if self.whole:
             return left
         if self._implicit:
             return 1
-        most = self._model.mesh.node_count
-        if self._settings.mode == 'budget':
-            most = min(most, self._settings.nodes)
-        if self.count >= most:
+        if self.count >= self._model.mesh.node_count:
             return min(max(_BLOCK_AWAKE, -(-total // _CHOICES_AWAKE)), left)
         return min(max(_BLOCK, int(_BLOCK * shortened)), left)
 
@@ -193,10 +188,6 @@ class ActiveRegion:
         restless = looked[self._quiet[looked] < _CHOICES_TO_SLEEP]
         seeds = np.concatenate([restless, coupling.nodes])
         awake = self._model.neighbours.around(seeds, self._rings)
-        if self._settings.mode == 'budget' and len(awake) > self._settings.nodes:
-            candidates, awake = awake, self._nearest(awake, v, coupling)
-            # The others sleep; a neighbour may wake them.
-            self._quiet[without(candidates, awake)] = _CHOICES_TO_SLEEP
         v.reshape(-1, 3)[without(self._awake, awake)] = 0.0
         region = self._region
         if region is None or not np.array_equal(awake, self._awake) or _misses(region, coupling):
@@ -235,20 +226,9 @@ class ActiveRegion:
             self._scratch = np.zeros((2, size))
         return self._scratch
 
-    def _nearest(self, awake: np.ndarray, v: np.ndarray, coupling: Coupling) -> np.ndarray:
-        """Return the awake nodes nearest to the tool, or the fastest without a tool; sorted."""
-        rest = self._model.mesh.rest
-        if coupling.mode == FREE:
-            rank = -np.square(v.reshape(-1, 3)[awake]).sum(axis=1)
-        else:
-            here = coupling.weights @ rest[coupling.nodes]
-            rank = np.square(rest[awake] - here).sum(axis=1)
-        most = self._settings.nodes
-        return np.sort(awake[np.argpartition(rank, most - 1)[:most]])
-
-    def follow_cut(self, nodes: np.ndarray) -> None:
-        """Wake the nodes touched by a cut, shape (r,)."""
-        n = self._model.mesh.node_count
+    def follow_cut(self, touched: Touched) -> None:
+        """Wake the nodes touched by a cut."""
+        n, nodes = self._model.mesh.node_count, touched.nodes
         if self.whole:
             self._awake = np.arange(n)
             return

@@ -11,7 +11,6 @@ from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.adjacency import spans_of
 from cutting_trainer.tissue_sim.mesh.checks import EDGES, components
 from cutting_trainer.tissue_sim.mesh.pieces import free_parts
-from cutting_trainer.tissue_sim.mesh.strain import Strain
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import (
     TetMesh,
     TopologyDelta,
@@ -26,6 +25,8 @@ from cutting_trainer.tissue_sim.motion.active_region import (
 )
 from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
 from cutting_trainer.tissue_sim.motion.elastic_state import ElasticState
+from cutting_trainer.tissue_sim.motion.far_field import FarField
+from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
 from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
 from cutting_trainer.tissue_sim.motion.loads import Loads
 from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
@@ -65,30 +66,6 @@ class TimeStepping:
     min_substeps: int = 1
     max_substeps: int = 200
     frequency_growth: float = 3.0
-
-
-@dataclass(frozen=True)
-class FrameMotion:
-    """Motion of one frame.
-
-    Attributes:
-        elastic_force: against the displacement, less weight and viscous relief [N], shape (n, 3).
-        kinetic_energy, elastic_energy: [J]; the latter with that of weight and viscosity.
-        substeps: number of substeps.
-        slow_motion: simulated time over frame time.
-        trouble: the error; empty: none.
-        diverged: shorter steps did not help, and the frame was rolled back.
-        strain: of a model with a law.
-    """
-
-    elastic_force: np.ndarray
-    kinetic_energy: float
-    elastic_energy: float
-    substeps: int
-    slow_motion: float
-    trouble: str = ''
-    diverged: bool = False
-    strain: Strain | None = None
 
 
 class Dynamics:
@@ -142,10 +119,12 @@ class Dynamics:
         self._caution = 1
         self._cautious = 0
         self._detector = DivergenceDetector(mesh, material.youngs_modulus)
-        self._active = ActiveRegion(
-            self.model,
-            active or ActiveSettings(),
-            implicit=self.stepping.integrator == 'implicit',
+        active = active or ActiveSettings()
+        self._far: FarField | None = None
+        if active.mode == 'budget' and active.nodes < mesh.node_count:
+            self._far = FarField(self.model, active.nodes)
+        self._active = self._far or ActiveRegion(
+            self.model, active, implicit=self.stepping.integrator == 'implicit'
         )
         if self.bound() == 0.0:
             raise ValueError(
@@ -184,11 +163,6 @@ class Dynamics:
     def active_nodes(self) -> int:
         """Number of moving nodes."""
         return self._active.count
-
-    @property
-    def held_to(self) -> np.ndarray | None:
-        """The only nodes that can move, sorted, shape (a,); None: all that are not fixed."""
-        return self._active.held_to
 
     @property
     def inverted(self) -> int:
@@ -257,7 +231,7 @@ class Dynamics:
         """
         if self.loads is not None:
             self.loads.refresh(self._u[: 3 * self.mesh.node_count])
-        if self._touched:
+        if self._touched or len(self._elastic.force) != self.mesh.node_count:
             self._begin_account()  # a pass over the tissue, which must not slow down a batch
         self._frequency.refine()
         if self._cautious:
@@ -265,7 +239,8 @@ class Dynamics:
             self._caution = self._caution if self._cautious else 1
         if self._stiffened is not None:
             flat = self._u[: 3 * self.mesh.node_count]
-            self._stiffened.begin(flat, self._frequency.omega, self.inverse_mass)
+            operands = self._far.operands() if self._far else self.model.operands()
+            self._stiffened.begin(flat, self._frequency.omega, self.inverse_mass, operands)
         substeps, dt = self._substeps(coupling)
         self._hold_back(tool is None and coupling.mode == FREE)
         before = (self._u.copy(), self._v.copy())
@@ -285,7 +260,7 @@ class Dynamics:
                 continue
             trouble = trouble or f'{found}: {self._cause(coupling, dt)}'
             self._u, self._v = before[0].copy(), before[1].copy()
-            self.model.restart_rotations(self.displacement)
+            self._turn_back()
             known = not self.model.rotating and self.stepping.integrator != 'implicit'
             if self._caution * _FINER > (_FINER if known else _FINEST):
                 break
@@ -329,13 +304,35 @@ class Dynamics:
         v[: 3 * n].reshape(-1, 3)[lost] = 0.0
         self.inverse_mass.reshape(-1, 3)[lost] = 0.0
         self._u, self._v = u.copy(), v.copy()
-        self.model.restart_rotations(self.displacement)
+        self._turn_back()
         self._touched.append(np.arange(n))
         return True
 
+    def _turn_back(self) -> None:
+        """Let rotations and force be those of the present displacement."""
+        self.model.restart_rotations(self.displacement)
+        if self._far is not None:
+            self._elastic.whole(self.displacement)
+
+    def _state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return displacement [m] and velocity [m/s] with those of unknowns of the far field."""
+        size = 3 * self.mesh.node_count + self._active.extra
+        self._u, self._v = grown(self._u, size), grown(self._v, size)
+        return self._u[:size], self._v[:size]
+
+    def _choose(self, coupling: Coupling) -> Region:
+        u, v = self._state()
+        if isinstance(self._active, FarField):
+            if coupling.mode == FREE:
+                self._active.relax(u, self._elastic.force, self.inverse_mass, self.omega)
+                self._elastic.whole(self.displacement)
+            return self._active.choose(u, v, self._elastic.force, self.inverse_mass, coupling)
+        b = self.material.beta
+        return self._active.choose(u, v, b, self.inverse_mass, coupling, self._frame_time)
+
     def _integrate(self, coupling: Coupling, dt: float, substeps: int, tool: Tool | None) -> float:
         size = 3 * self.mesh.node_count
-        moving = self._v[:size]
+        moving = self._state()[1][:size]
         calm = self.loads is None or self.loads.settled
         free = tool is None and coupling.mode == FREE
         if free and calm and float(np.abs(moving).max()) < _AT_REST:
@@ -354,19 +351,14 @@ class Dynamics:
         adapt = 0
         while done < substeps:
             if region is None or not self._active.whole:
-                region = self._active.choose(
-                    self._u[:size],
-                    moving,
-                    self.material.beta,
-                    self.inverse_mass,
-                    coupling,
-                    self._frame_time,
-                )
+                region = self._choose(coupling)
             steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
             if self._stiffened is not None:
                 if done >= adapt:
-                    inverse = self.inverse_mass
-                    self._stiffened.adapt(self._u[:size], moving, inverse, begun=done == 0)
+                    operands = self._far.operands() if self._far else self.model.operands()
+                    begun = done == 0 and self._far is None
+                    given = self._u[:size], moving, self.inverse_mass, operands
+                    self._stiffened.adapt(*given, begun=begun)
                     adapt = done + SUBSTEPS_BETWEEN
                 steps = min(steps, adapt - done)
             if self.loads is not None:
@@ -383,22 +375,31 @@ class Dynamics:
                     break  # a diverged tissue holds no tool: the frame will be taken back
                 coupling = tool.after(done / substeps, self.positions)
                 spring = coupling.spring(self.mesh.rest)
+                if self._far is not None and not self._far.covers(coupling):
+                    self._far.follow(*self._state(), size)
+                    self._elastic.whole(self.displacement)
+                    region = None
+        if self._far is not None:
+            self._far.follow(*self._state(), size)
         return work
 
     def _steps(
         self, region: Region, spring: Spring, dt: float, steps: int, *, first: int, total: int
     ) -> float:
         """Move the nodes of a region by some substeps; return the work of the spring [J]."""
-        size, place = 3 * self.mesh.node_count, region.place
+        place = region.place
         at = slice(None) if place is None else place.at
-        u, v = self._u[:size][at], self._v[:size][at]
+        u, v = (values[at] for values in self._state())
+        inverse, diagonal = self._present_inverse(), self.model.diagonal
+        if self._far is not None:
+            inverse, diagonal = self._far.inverse(inverse), self._far.diagonal(diagonal)
         operands = region.operands
         if place is not None and self.loads is not None:
             operands = operands._replace(load=self.model.load[place.at[: 3 * place.moving]])
         work = self._integrator.step(
             operands,
-            self._present_inverse()[at],
-            self.model.diagonal[at],
+            inverse[at],
+            diagonal[at],
             spring if place is None else place.spring(spring),
             u,
             v,
@@ -454,14 +455,20 @@ class Dynamics:
         """
         self._still, self._loose = 0, None
         n, total = self.mesh.node_count, self.mesh.node_count + len(delta.node_parents)
+        unknowns = self._state()[1][3 * n :].copy()
         touched = self.mesh.apply(delta)
         self._u, self._v = grown(self._u, 3 * total), grown(self._v, 3 * total)
         for values in (self._u, self._v):
             carried_over(values[: 3 * total].reshape(-1, 3), n, delta, touched)
+        if self._far is not None:
+            self._far.release(touched)
         self.model.update(touched)
         if self.loads is not None:
             self.loads.apply_cut(n, delta, touched)
         self._follow_cut(touched.nodes)
+        self._active.follow_cut(touched)
+        velocity = self._state()[1][3 * self.mesh.node_count :]
+        velocity[:] = grown(unknowns, len(velocity))[: len(velocity)]
         return touched
 
     def resume(self, displacement: np.ndarray) -> None:
@@ -494,7 +501,7 @@ class Dynamics:
         """Return force [N], shape (n, 3), and energy [J], recomputed where they may have
         changed.
         """
-        if self._active.whole:
+        if not isinstance(self._active, ActiveRegion) or self._active.whole:
             self._touched = []
             return self._elastic.whole(self.displacement)
         n, touched = self.mesh.node_count, self._touched
@@ -530,5 +537,4 @@ class Dynamics:
         self.inverse_mass.reshape(-1, 3)[nodes] = inverse[:, None]
         if self._stiffened is not None:
             self._stiffened.follow_cut()
-        self._active.follow_cut(nodes)
         self._touched.append(nodes)

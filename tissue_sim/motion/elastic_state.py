@@ -32,6 +32,11 @@ class ElasticState:
         self._products = np.zeros(0)
         return self._force, energy
 
+    @property
+    def force(self) -> np.ndarray:
+        """Force of the last call [N], shape (n, 3); a view that the next call overwrites."""
+        return self._force
+
     def renewed(self, u: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the same, recomputed only at some nodes and their neighbours.
 

@@ -165,7 +165,8 @@ def implicit_steps(
     x[:] = v
     for step in range(first, first + steps):
         at = (step + 1) / total
-        internal_force(operands, u, f, 3)
+        q[:] = u  # the force moves far nodes, which are not part of the state
+        internal_force(operands, q, f, 3)
         for attempt in range(_SECANTS):
             if spring.mode != 0:
                 # Estimated stretch at the end of the step.

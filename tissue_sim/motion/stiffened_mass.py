@@ -9,7 +9,7 @@ import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.elasticity.adaptive_law import add_tangent_rows, linear_rows
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands
 from cutting_trainer.tissue_sim.elasticity.stiffening import MAX_EXPONENT, MIN_RATIO
 from cutting_trainer.tissue_sim.mesh.strain import Strain
 
@@ -96,30 +96,38 @@ class StiffenedMass:
         self._linear = self._linear_rows()
         self._inverse = np.zeros(0)
 
-    def _squares(self, u: np.ndarray) -> np.ndarray:
+    def _squares(self, u: np.ndarray, o: Operands) -> np.ndarray:
         """Return squared frequencies of strained nodes, 0 elsewhere [1/s^2], shape (n,)."""
-        o, n = self._model.operands(), len(self._linear)
+        n = len(self._linear)
         if len(self._rows) != n:
             self._rows, self._squared = np.zeros(n), np.zeros(n)
         self._rows[:] = self._linear
-        add_tangent_rows(o.law, o.domains, o.elements, o.chunks, u, self._rows, self._strain)
+        parts = o.law, o.domains, o.elements, o.awake, o.chunks
+        add_tangent_rows(*parts, u, self._rows, self._strain)
         _squared(self._rows, self._linear, self._model.mass, _HEADROOM * self._scale, self._squared)
         return self._squared
 
-    def begin(self, u: np.ndarray, base: float, inverse: np.ndarray) -> None:
+    def begin(self, u: np.ndarray, base: float, inverse: np.ndarray, operands: Operands) -> None:
         """Choose the frequency of a frame.
 
         Args:
             u: displacement by coordinate [m], shape (3 n,).
             base: bound of the frequency without strain [rad/s].
             inverse: inverse masses without strain [1/kg], shape (3 n,).
+            operands: of the points that have a law.
         """
         free = inverse[::3] > 0.0
-        most = float(np.sqrt(self._squares(u)[free].max(initial=0.0)))
+        most = float(np.sqrt(self._squares(u, operands)[free].max(initial=0.0)))
         self._omega = max(base, min(most, max(self._ceiling, base)))
 
     def adapt(
-        self, u: np.ndarray, v: np.ndarray, inverse: np.ndarray, *, begun: bool = False
+        self,
+        u: np.ndarray,
+        v: np.ndarray,
+        inverse: np.ndarray,
+        operands: Operands,
+        *,
+        begun: bool = False,
     ) -> np.ndarray:
         """Return the inverse masses for the next substeps [1/kg], shape (3 n,).
 
@@ -130,13 +138,14 @@ class StiffenedMass:
             u: displacement by coordinate [m], shape (3 n,).
             v: velocity [m/s], changed, shape (3 n,).
             inverse: inverse masses without strain [1/kg], shape (3 n,).
-            begun: whether `begin` had the same displacement.
+            operands: of the points that have a law.
+            begun: whether `begin` had the same displacement and operands.
         """
         known = len(self._inverse) == len(inverse)
         if not known:
             self._inverse = inverse.copy()
         if not begun:
-            self._squares(u)
+            self._squares(u, operands)
         mass = self._model.mass
         heavier, more = _adapted(
             self._squared, mass, self._omega**2, inverse, self._inverse, v if known else v[:0]

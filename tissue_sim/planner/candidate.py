@@ -22,7 +22,7 @@ class ErrorEstimate:
         rotation: largest rotation, for models without rotations.
         strain: largest displacement, for the model's strain measure.
         time: step size, at the pace of a palpating hand.
-        region: held nodes.
+        region: nodes that do not move on their own.
     """
 
     elements: float

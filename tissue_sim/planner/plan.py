@@ -128,7 +128,7 @@ def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
         tried += found
         fitting = [c for c in found if task.fits(c)]
         best = _lighter(task, _preferred(task, fitting), rejected) if fitting else None
-        best = best or _held(task, found, rejected)
+        best = best or _near_the_tool(task, found, rejected)
         if best is not None:
             rejected += [dearer(c, best) for c in fitting if c.name != best.name]
             return Plan(best, tuple(rejected), (), task, count, probing)
@@ -173,9 +173,11 @@ def _lighter(task: Task, best: Candidate, rejected: list[Rejection]) -> Candidat
     return best
 
 
-def _held(task: Task, found: list[Candidate], rejected: list[Rejection]) -> Candidate | None:
-    """Return the cheapest of the too expensive methods, with as many moving nodes as the cost
-    allows.
+def _near_the_tool(
+    task: Task, found: list[Candidate], rejected: list[Rejection]
+) -> Candidate | None:
+    """Return the cheapest of the too expensive methods, with as many nodes that move on their own
+    as the cost allows.
     """
     dear = [c for c in found if c.errors.total <= task.budget.error and not task.in_time(c)]
     cheapest = min(dear, key=lambda c: task.worst(c).frame, default=None)

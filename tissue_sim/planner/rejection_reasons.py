@@ -48,7 +48,9 @@ def unfit(task: Task, candidate: Candidate) -> Rejection:
     after = ' when cuts have shortened the step' if cost != candidate.cost else ''
     if errors.total > task.budget.error:
         by_step = f'{percent(errors.time)} of it by steps of {ms(cost.step)}'
-        by_region = f', {percent(errors.region)} by nodes that are held' if errors.region else ''
+        by_region = (
+            f', {percent(errors.region)} by far nodes that move together' if errors.region else ''
+        )
         return Rejection(candidate.name, f'{percent(errors.total)}, {by_step}{by_region}')
     if cost.frame > task.available:
         return Rejection(

@@ -153,9 +153,8 @@ class ContactStiffness:
     def _compliance(
         self, point: PointCompliance, nodes: np.ndarray, weights: np.ndarray, axes: np.ndarray
     ) -> np.ndarray:
-        """Return the compliance of the simulated nodes; nodes held by a budget do not yield."""
         d = self._dynamics
-        return point.estimate(d.model, d.inverse_mass > 0, nodes, weights, axes, d.held_to)
+        return point.estimate(d.model, d.inverse_mass > 0, nodes, weights, axes)
 
 
 class GrippingStiffness(ContactStiffness):

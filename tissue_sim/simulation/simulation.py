@@ -15,7 +15,8 @@ from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, find_t
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, Touched
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.divergence import MAX_TOOL_SPEED
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, FrameMotion, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
 from cutting_trainer.tissue_sim.simulation.local_stiffness import (
     ContactStiffness,
     GrippingStiffness,

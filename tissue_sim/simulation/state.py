@@ -17,6 +17,7 @@ from cutting_trainer.tissue_sim.contact import tool as contact
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.elasticity import (
     adaptive_law,
+    coarse_rows,
     compliance,
     corotational,
     local_rows,
@@ -34,8 +35,11 @@ from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion import (
     active_region,
+    coarse_grid,
+    coarse_stiffness,
     dynamics,
     elastic_state,
+    far_field,
     integrators,
     loads,
     stability,
@@ -57,6 +61,9 @@ _MODULES = (
     active_region,
     adaptive_law,
     blade,
+    coarse_grid,
+    coarse_rows,
+    coarse_stiffness,
     compliance,
     contact,
     contact_stiffness,
@@ -67,6 +74,7 @@ _MODULES = (
     edge,
     elastic_state,
     elasticity,
+    far_field,
     footprint,
     fracture,
     friction,

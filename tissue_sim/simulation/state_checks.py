@@ -143,7 +143,10 @@ def check_simulation(simulation: TissueSimulation) -> None:
         has_room('_linear', dynamics._stiffened._linear, n)
     _check_model(model, n)
     _check_estimates(simulation, n)
-    _check_region(dynamics._active, n)
+    if dynamics._far is None:
+        _check_region(dynamics._active, n)
+    else:
+        _check_far_field(dynamics, n)
     _check_blade(simulation, n)
 
 
@@ -281,6 +284,39 @@ def _check_estimates(simulation: TissueSimulation, n: int) -> None:
     work: Any = dynamics._integrator._work
     has_room('_work', work, 7, *work.shape[1:])
     has_room('_damping', dynamics._integrator._damping, 2)
+
+
+def _check_far_field(dynamics: Any, n: int) -> None:
+    far = dynamics._far
+    grid, stiffness, model = far._grid, far._stiffness, dynamics.model
+    if dynamics._active is not far or far._model is not model or stiffness._model is not model:
+        raise StateError('the far field is of another tissue')
+    if stiffness._grid is not grid or grid._mesh is not model.mesh:
+        raise StateError('the far field has another grid')
+    if grid._neighbours is not model._neighbours:
+        raise StateError('the grid has the neighbours of another tissue')
+    has_room('_shape', grid._shape, 3)
+    within('_shape', grid._shape, 1 << 20, 2)
+    has_room('_cell', grid._cell, n, 3)
+    for axis in range(3):
+        within('_cell', grid._cell[:n, axis], int(grid._shape[axis]) - 1)
+    has_room('columns', grid.columns, n, 8)
+    has_room('weights', grid.weights, n, 8)
+    within('columns', grid.columns[:n], grid.count, -1)
+    if (grid.weights[:n][grid.columns[:n] < 0] != 0.0).any():
+        raise StateError('a node follows an unknown that is none')
+    count, slots = len(stiffness.used), len(stiffness.neighbours)
+    within('unknowns', [count], grid.count + 1)
+    room = slots // max(count, 1)
+    if slots != room * count:
+        raise StateError(f'{count} unknowns share {slots} slots')
+    within('used', stiffness.used, room + 1)
+    within('neighbours', stiffness.neighbours, max(3 * count, 1))
+    has_room('blocks', stiffness.blocks, 9 * slots + 1)
+    has_room('_level', far._level, n)
+    within('_far', far._far, n)
+    has_room('_mass', far._mass, 0)
+    within('_mass', [len(far._mass)], grid.count + 1)
 
 
 def _check_region(active: Any, n: int) -> None:
