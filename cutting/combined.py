@@ -39,8 +39,6 @@ _CLOSED = (
     '({:.1f}, {:.1f}, {:.1f}) mm at rest: elements with edges of {:.1f} mm are too large for a cut '
     'so shallow'
 )
-_MAX_CLOSED = 0.25
-"""Swept area that may stay closed unsaid, in squared edges."""
 FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
 
 
@@ -177,7 +175,7 @@ class CombinedMethod:
         delta, more, opened = slide_front(mesh, delta, nodes, self._first_new, lines, h, small)
         said = [_HOLDS.format(*1e3 * place) for place in places[:1]]
         closed, middle = closed_area(mesh, lines, opened, h)
-        if closed > _MAX_CLOSED * h**2 and not folded:
+        if closed > 0.0 and not folded:
             said.append(_CLOSED.format(1e4 * closed, *1e3 * middle, 1e3 * h))
         return delta, area + more, said
 

@@ -14,10 +14,14 @@ _STEP = 0.25
 """Way between two places that are looked at, in edges."""
 _NEAR = 0.6
 """Distance from the opened faces up to which a place counts as opened, in edges."""
+_MIN_AREA = 0.5
+"""Closed area that matters, in squared edges."""
 
 
 def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple[float, Floats]:
-    """Return the swept area in the tissue that is not opened [m^2], and its middle [m], shape (3,).
+    """Return the swept area that is not opened [m^2], and its middle [m], shape (3,).
+
+    Less than half a squared edge does not matter, and counts as none.
 
     Args:
         mesh: the tissue.
@@ -26,6 +30,9 @@ def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple
         opened: faces opened by cuts around the stroke.
         h: length of an edge [m].
     """
+    if len(opened.triangles):  # slivers are longer than their altitudes say
+        sides = np.diff(opened.rest[opened.triangles[:, [0, 1, 2, 0]]], axis=1)
+        h = max(h, float(np.median(np.linalg.norm(sides, axis=2))))
     edges = lines[:, 1] - lines[:, 0]
     longest = float(np.linalg.norm(edges, axis=1).max())
     count = int(np.ceil(longest / (_STEP * h)))
@@ -43,7 +50,7 @@ def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple
     earlier = mesh.triangles[mesh.triangle_kind == CUT]
     closed = np.minimum(distance, _distances(places, mesh.rest, earlier)) > _NEAR * h
     area = float(areas[closed].sum())
-    if area == 0.0:
+    if area < _MIN_AREA * h**2:
         return 0.0, np.zeros(3)
     return area, areas[closed] @ places[closed] / area
 
