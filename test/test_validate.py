@@ -48,7 +48,7 @@ def test_the_cube_has_the_stress_of_the_law_in_tension_and_shear() -> None:
 @pytest.mark.parametrize('cell', [0.0053, 0.0044])
 def test_the_steady_force_of_a_blade_is_toughness_times_its_depth(cell: float) -> None:
     found = drawn('stiffening', 187.0, E0, cell)
-    assert found.force[0] == pytest.approx(187.0 * found.depth, rel=0.06)
+    assert found.force[0] == pytest.approx(187.0 * found.depth, rel=0.07)
 
 
 def test_a_blade_that_slices_feels_the_force_of_atkins() -> None:
