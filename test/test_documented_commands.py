@@ -137,6 +137,9 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     'python -m bench.cuts.severance': Nowhere(
         'takes minutes: test_cutting_severance.py does it to fewer cuts'
     ),
+    'python -m bench.cuts.loose_pieces': Nowhere(
+        'takes minutes: test_pieces.py does it to fewer pieces'
+    ),
     './trainer clean': Elsewhere('test_launcher.py::test_clean_leaves_nothing_but_the_lock'),
     './trainer record -o BAG': Elsewhere(
         'test_bags_live.py::'

@@ -25,10 +25,10 @@ from bench.cuts.curves import (
     scattered,
     slab,
 )
-from cutting_trainer.cutting.method import CutMethod
-from cutting_trainer.cutting.methods import make_method
-from cutting_trainer.cutting.settings import CuttingSettings
-from cutting_trainer.session.scene import load_scene
+from cutting_trainer.cutting.method_interface import CutMethod
+from cutting_trainer.cutting.method_registry import make_method
+from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.pieces import Piece, PieceRegister, free_parts
