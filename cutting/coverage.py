@@ -5,8 +5,7 @@ import numpy as np
 from cutting_trainer.cutting.bridges import GAP
 from cutting_trainer.cutting.front import Opened
 from cutting_trainer.cutting.parting import Floats
-from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, find_tetrahedra
+from cutting_trainer.tissue_sim.mesh.locate import distances_to_triangles, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 
@@ -46,20 +45,10 @@ def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple
     outside = np.linalg.norm(along, axis=2).mean(axis=1) > GAP * h
     inside = (found >= 0) & ~np.repeat(outside, count)
     places, areas = places[inside], areas[inside]
-    distance = _distances(places, opened.rest, opened.triangles)
+    distance = distances_to_triangles(places, opened.rest, opened.triangles)
     earlier = mesh.triangles[mesh.triangle_kind == CUT]
-    closed = np.minimum(distance, _distances(places, mesh.rest, earlier)) > _NEAR * h
+    closed = np.minimum(distance, distances_to_triangles(places, mesh.rest, earlier)) > _NEAR * h
     area = float(areas[closed].sum())
     if area < _MIN_AREA * h**2:
         return 0.0, np.zeros(3)
     return area, areas[closed] @ places[closed] / area
-
-
-@kernel
-def _distances(places, rest, triangles):
-    """Return the distance of places from the nearest of some triangles [m], shape (p,)."""
-    out = np.full(len(places), np.inf)
-    if len(triangles):
-        for k in range(len(places)):
-            out[k] = distance_to_triangles(places[k], rest, triangles)
-    return out

@@ -5,13 +5,21 @@ nodes slide in the rest shape to the nearest place on the path of the blade's en
 elements around them stay well shaped.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cutting_trainer.cutting.geometry import altitude
-from cutting_trainer.cutting.parting import Floats, Ints, Local, local_elements
+from cutting_trainer.cutting.geometry import altitude, smallest_altitudes
+from cutting_trainer.cutting.parting import (
+    Floats,
+    Ints,
+    Local,
+    area_of,
+    list_corners,
+    local_elements,
+)
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.mesh.locate import find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
@@ -81,10 +89,10 @@ def slide_front(
     lost = found < 0
     rest[fronts[lost]] = local.rest[fronts[lost]]
     fronts, found, weights = fronts[~lost], found[~lost], weights[~lost]
-    if (_least_altitudes(rest, local.corners) <= 0.0).any():
+    if (smallest_altitudes(rest, local.corners) <= 0.0).any():
         return delta, 0.0, Opened(local.rest, opened)
     parents = mesh.tetrahedra[found].astype(np.int64)
-    further = _areas(rest, opened) - _areas(local.rest, opened)
+    further = area_of(rest[opened]) - area_of(local.rest[opened])
     delta = _with_places(mesh, delta, local.nodes[fronts], parents, weights)
     return delta, further, Opened(rest, opened)
 
@@ -136,16 +144,6 @@ def _nearest_on(path: Floats, places: Floats) -> tuple[Floats, Floats]:
 
 
 @kernel
-def _least_altitudes(rest, corners):
-    """Return the smallest altitude of each element [m]; negative inside out."""
-    out = np.empty(len(corners))
-    for k in range(len(corners)):
-        a, b, c, d = corners[k, 0], corners[k, 1], corners[k, 2], corners[k, 3]
-        out[k] = altitude(rest[a], rest[b], rest[c], rest[d])
-    return out
-
-
-@kernel
 def _slide(rest, corners, fronts, targets, small):
     """Move nodes towards their targets, as far as the elements around them stay well shaped.
 
@@ -156,11 +154,7 @@ def _slide(rest, corners, fronts, targets, small):
         targets: [m], shape (f, 3).
         small: altitude below which no element gets [m].
     """
-    first, following = np.full(len(rest), -1, np.int64), np.empty(4 * len(corners), np.int64)
-    for corner in range(4 * len(corners) - 1, -1, -1):
-        node = corners[corner // 4, corner % 4]
-        following[corner] = first[node]
-        first[node] = corner
+    first, following = list_corners(corners, len(rest))
     least = np.full(len(fronts), -1.0)
     for _ in range(_SWEEPS):
         for k in range(len(fronts)):
@@ -189,12 +183,6 @@ def _smallest(rest, corners, first, following, node):
     return smallest
 
 
-def _areas(rest: Floats, triangles: Ints) -> float:
-    """Return the area of some triangles [m^2]."""
-    a, b, c = np.moveaxis(rest[triangles], 1, 0)
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-
-
 def _with_places(
     mesh: TetMesh, delta: TopologyDelta, nodes: Ints, parents: Ints, weights: Floats
 ) -> TopologyDelta:
@@ -211,13 +199,11 @@ def _with_places(
     node_parents[nodes[new] - mesh.node_count] = parents[new]
     node_weights[nodes[new] - mesh.node_count] = weights[new]
     stays = ~np.isin(delta.moved_nodes, nodes[~new])
-    return TopologyDelta(
+    return replace(
+        delta,
         node_parents=node_parents,
         node_weights=node_weights,
         moved_nodes=np.concatenate([delta.moved_nodes[stays], nodes[~new]]),
         moved_parents=np.concatenate([delta.moved_parents[stays], parents[~new]]),
         moved_weights=np.concatenate([delta.moved_weights[stays], weights[~new]]),
-        removed_tetrahedra=delta.removed_tetrahedra,
-        tetrahedra=delta.tetrahedra,
-        outer_faces=delta.outer_faces,
     )

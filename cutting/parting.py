@@ -1,5 +1,6 @@
 """Parting of tissue along faces of the mesh near a surface, by a least cut."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -321,6 +322,25 @@ def least_faces(
     return faces
 
 
+@inner
+def list_corners(corners, count):
+    """Return the first corner at each node, shape (count,), and the next one at the same node.
+
+    Args:
+        corners: of elements, numbers below `count`, shape (k, 4).
+        count: number of nodes.
+
+    Returns:
+        Corners 4 e + i, ascending at each node, then -1.
+    """
+    first, following = np.full(count, -1, np.int64), np.empty(4 * len(corners), np.int64)
+    for corner in range(4 * len(corners) - 1, -1, -1):
+        node = corners[corner // 4, corner % 4]
+        following[corner] = first[node]
+        first[node] = corner
+    return first, following
+
+
 @kernel
 def _split(faces, across, corners, volumes, whole):
     """Give a node of its own to each part of the elements around a node that some faces part.
@@ -341,11 +361,7 @@ def _split(faces, across, corners, volumes, whole):
         across[face // 4, face % 4] = across[other // 4, other % 4] = -1
         for i in range(3):
             concerned[corners[face // 4, FACE_NODES[face % 4, i]]] = True
-    first, following = np.full(count, -1, np.int64), np.empty(4 * len(corners), np.int64)
-    for corner in range(4 * len(corners) - 1, -1, -1):
-        node = corners[corner // 4, corner % 4]
-        following[corner] = first[node]
-        first[node] = corner
+    first, following = list_corners(corners, count)
     part = np.full(4 * len(corners), -1, np.int64)
     copies = [np.int64(0) for _ in range(0)]
     for node in range(count):
@@ -423,6 +439,12 @@ def _volumes(rest, corners):
     return volumes
 
 
+def area_of(triangles: Floats) -> float:
+    """Return the area of some triangles by their corners [m], shape (k, 3, 3), in m^2."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+
+
 def open_faces(
     mesh: TetMesh, delta: TopologyDelta, local: Local, faces: Ints
 ) -> tuple[TopologyDelta, float]:
@@ -437,10 +459,7 @@ def open_faces(
     own = corners[faces[:, None] // 4, FACE_NODES[faces % 4]]
     its = corners[local.across.ravel()[faces] // 4]
     opened = faces[~(own[:, :, None] == its[:, None]).any(axis=2).all(axis=1)]
-    a, b, c = np.moveaxis(
-        local.rest[local.corners[opened[:, None] // 4, FACE_NODES[opened % 4]]], 1, 0
-    )
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    area = area_of(local.rest[local.corners[opened[:, None] // 4, FACE_NODES[opened % 4]]])
     first = mesh.node_count + len(delta.node_parents)
     numbers = np.concatenate([local.nodes, np.arange(first, first + len(copies))])
     changed = (corners != local.corners).any(axis=1)
@@ -476,12 +495,10 @@ def _with_copies(
     tetrahedra = delta.tetrahedra.copy()
     tetrahedra[-1 - number[~old]] = corners[~old]
     stayed = number[old]
-    return TopologyDelta(
+    return replace(
+        delta,
         node_parents=np.concatenate([delta.node_parents, parents]),
         node_weights=np.concatenate([delta.node_weights, weights]),
-        moved_nodes=delta.moved_nodes,
-        moved_parents=delta.moved_parents,
-        moved_weights=delta.moved_weights,
         removed_tetrahedra=np.sort(np.concatenate([delta.removed_tetrahedra, stayed]))[::-1],
         tetrahedra=np.concatenate([tetrahedra, corners[old]]),
         outer_faces=np.concatenate([delta.outer_faces, outer_bits_of(mesh.links, stayed)]),

@@ -21,7 +21,7 @@ from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
-from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles
+from cutting_trainer.tissue_sim.mesh.locate import distances_to_triangles
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.integrators import Integrator
 from cutting_trainer.tissue_sim.motion.stability import FrequencyBound
@@ -212,8 +212,8 @@ def distances(mesh: TetMesh, paths: tuple[Floats, ...], h: float) -> tuple[Float
     area = np.linalg.norm(sides, axis=1)[:, None] / 2 * share
     sheet = np.concatenate([_continued(path, 2 * h) for path in paths])
     places, triangles = sheet.reshape(-1, 3), np.arange(3 * len(sheet)).reshape(-1, 3)
-    away = [distance_to_triangles(point, places, triangles) for point in points.reshape(-1, 3)]
-    return np.array(away) / h, area.ravel()
+    away = distances_to_triangles(points.reshape(-1, 3), places, triangles)
+    return away / h, area.ravel()
 
 
 def _continued(path: Floats, by: float) -> Floats:

@@ -24,6 +24,7 @@ from cutting_trainer.tissue_sim.contact.edge import (
     carry_edge,
     follow_device,
     gather_loads,
+    no_pull,
 )
 from cutting_trainer.tissue_sim.contact.fracture import Strips
 from cutting_trainer.tissue_sim.mesh.locate import NearElements
@@ -89,7 +90,6 @@ class Blade:
     def __init__(
         self, resistance: Resistance, root: np.ndarray, tip: np.ndarray, hint: int
     ) -> None:
-        self._resistance = resistance
         self._law = Law(1.0, resistance.toughness, resistance.friction)
         self._device = np.array([root, tip])
         self._moved = np.zeros((POINTS, 3))
@@ -112,7 +112,7 @@ class Blade:
         self._back: np.ndarray | None = None
         self._failed = self._set_back = False
         self.paid = self.rubbed = 0.0
-        self._settle(Pull(np.zeros(3), np.zeros(3), 0.0, np.zeros((2, 3)), 0.0, 0.0, 0.0))
+        self._settle(no_pull(0.0, 0.0))
 
     @property
     def device(self) -> np.ndarray:
@@ -122,7 +122,7 @@ class Blade:
     @property
     def stretch(self) -> np.ndarray:
         """From the edge to the device's edge, at the points in the tissue [m], shape (p, 3)."""
-        return np.asarray((points_of(self._device) - self._state.points)[self._state.spans > 0.0])
+        return self._stretch()[self._state.spans > 0.0]
 
     def kept(self) -> dict[str, Any]:
         """Return the state for `restore`."""
@@ -192,7 +192,7 @@ class Blade:
         """Let the edge follow the device without force: nothing is known of the tool."""
         self._state.spans[:] = 0.0
         self._strips.counts[:] = 0
-        self._settle(Pull(np.zeros(3), np.zeros(3), 0.0, np.zeros((2, 3)), 0.0, 0.0, 0.0))
+        self._settle(no_pull(0.0, 0.0))
 
     def spring(
         self, positions: np.ndarray, ahead: np.ndarray, share: float, stiffness: float
@@ -209,7 +209,7 @@ class Blade:
         inside = spans > 0.0
         if not inside.any():
             return Coupling()
-        forces = spans * ((points_of(self._device) - self._state.points) @ self.force)
+        forces = spans * (self._stretch() @ self.force)
         loads = spans / spans.sum()
         if self.force @ self.force > 0.0 and forces.sum() > _ONE_WAY * np.abs(forces).sum():
             loads = forces / forces.sum()
@@ -228,6 +228,10 @@ class Blade:
             stiffness=whole,
             limit=self.limit,
         )
+
+    def _stretch(self) -> np.ndarray:
+        """Return from the edge to the device's edge at all points [m], shape (POINTS, 3)."""
+        return np.asarray(points_of(self._device) - self._state.points)
 
     def _settle(self, pull: Pull) -> None:
         """Update the output, and the edge as a line."""

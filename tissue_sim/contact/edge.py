@@ -106,6 +106,12 @@ class Pull(NamedTuple):
     rubbed: float
 
 
+@inner
+def no_pull(paid, rubbed):
+    """Return the `Pull` of an edge in the air, with the works so far [J]."""
+    return Pull(np.zeros(3), np.zeros(3), 0.0, np.zeros((2, 3)), 0.0, paid, rubbed)
+
+
 @kernel
 def follow_device(edge, strips, device, moved, tissue, law):
     """Let the edge slip after the device's edge, and return its `Pull`.
@@ -124,8 +130,7 @@ def follow_device(edge, strips, device, moved, tissue, law):
     paid, rubbed, limit = 0.0, 0.0, -1.0
     if not edge.spans.any():
         strips.counts[:] = 0
-        none = np.zeros(3)
-        return Pull(none, none.copy(), 0.0, np.zeros((2, 3)), 0.0, paid, rubbed)
+        return no_pull(paid, rubbed)
     low, high = _box(edge, device)
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
     for _ in range(_MAX_SLIPS):

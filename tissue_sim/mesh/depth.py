@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, find_tetrahedra
+from cutting_trainer.tissue_sim.mesh.locate import distances_to_triangles, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
@@ -31,6 +31,6 @@ class SurfaceDepth:
         mesh, points = self._mesh, np.ascontiguousarray(points)
         found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, points)
         out = np.zeros(len(points))
-        for i in np.flatnonzero(found >= 0):
-            out[i] = distance_to_triangles(points[i], mesh.rest, self._free)
+        inside = found >= 0
+        out[inside] = distances_to_triangles(points[inside], mesh.rest, self._free)
         return out

@@ -212,6 +212,21 @@ def distance_to_triangles(point, positions, triangles):
 
 
 @kernel
+def distances_to_triangles(points, positions, triangles):
+    """Return the distances of points to the nearest of some triangles [m], shape (p,).
+
+    Args:
+        points: [m], shape (p, 3).
+        positions: nodes [m], shape (n, 3).
+        triangles: nodes of each, shape (k, 3); without any, distances are infinite.
+    """
+    out = np.empty(len(points))
+    for k in range(len(points)):
+        out[k] = np.sqrt(_closest(points[k], positions, triangles)[0])
+    return out
+
+
+@kernel
 def closest_triangle(point, positions, triangles):
     """Return the number of the triangle closest to a point.
 

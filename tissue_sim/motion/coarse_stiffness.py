@@ -21,12 +21,18 @@ _LISTED = 1024
 
 
 @inner
-def _listed(ids, count, unknown):
-    """Return the place of an unknown in a list, -1: it is not there."""
+def _listed(ids, values, count, unknown):
+    """Return the place of an unknown in a list, and the length of the list.
+
+    An unknown that is not there comes to the end, with values of 0.
+    """
     for k in range(count):
         if ids[k] == unknown:
-            return k
-    return -1
+            return k, count
+    ids[count] = unknown
+    for m in range(values.shape[1]):
+        values[count, m] = 0.0
+    return count, count + 1
 
 
 @inner
@@ -83,12 +89,7 @@ def _add_gradient(ids, count, g, columns, weights, node, x, y, z):
         w = weights[node, c]
         if w == 0.0:
             continue
-        k = _listed(ids, count, columns[node, c])
-        if k < 0:
-            k = count
-            ids[k] = columns[node, c]
-            g[k, 0] = g[k, 1] = g[k, 2] = 0.0
-            count += 1
+        k, count = _listed(ids, g, count, columns[node, c])
         g[k, 0] += w * x
         g[k, 1] += w * y
         g[k, 2] += w * z
@@ -120,13 +121,7 @@ def _add_rows(matrix, rows, columns, weights, nodes, sign):
                 w = weights[node, c]
                 if w == 0.0:
                     continue
-                k = _listed(ids, count, columns[node, c])
-                if k < 0:
-                    k = count
-                    ids[k] = columns[node, c]
-                    for m in range(9):
-                        sums[k, m] = 0.0
-                    count += 1
+                k, count = _listed(ids, sums, count, columns[node, c])
                 for m in range(9):
                     sums[k, m] += share * w * tensor[m]
         for c in range(8):
