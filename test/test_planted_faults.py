@@ -11,7 +11,7 @@ import pytest
 from bench.faults import run
 from bench.faults.candidates import KINDS, Fault, draw
 from bench.faults.copy import Outcome, read_outcome
-from bench.faults.suspects import likely_tests
+from bench.faults.suspects import affected_functions, likely_tests
 
 pytestmark = pytest.mark.long
 
@@ -50,6 +50,16 @@ def test_tests_that_name_a_function_are_tried_first() -> None:
     near = likely_tests(ROOT, fault)
     assert len(near) == len(list((ROOT / 'test').glob('test_*.py')))
     assert near[0].startswith('test/test_cutting') or 'broad_phase' in near[0]
+
+
+def test_kernels_that_call_a_faulty_one_at_any_depth_are_compiled_again_and_no_others() -> None:
+    sources = {
+        'a.py': 'def f(x):\n    return x\ndef g(x):\n    return x\nTABLE = f(1)\n',
+        'b.py': 'from a import f\ndef h(x):\n    return f(x)\ndef i(x):\n    return TABLE\n',
+        'c.py': 'import b\ndef k(x):\n    return b.h(x)\ndef m(x):\n    return g(x)\n',
+    }
+    affected = affected_functions(sources, 'f')
+    assert affected == {'a.py': {'f', 'TABLE'}, 'b.py': {'h', 'i'}, 'c.py': {'k'}}
 
 
 def test_an_outcome_names_the_test_that_failed_or_that_a_limit_ended() -> None:

@@ -2,11 +2,12 @@
 
 The copy shares the environment of the checkout. Numba finds its compiled kernels by the folder,
 the time and the size of a source file, so each fault has a cache of hard links to the checkout's,
-without the kernels of the faulty module and of those that call them.
+without the faulty kernel and those that call it.
 """
 
 import hashlib
 import os
+import pickle
 import re
 import shutil
 import signal
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.faults.candidates import ROOMS, Fault
-from bench.faults.suspects import dependents, import_graph
+from bench.faults.suspects import affected_functions
 
 _SCRATCH_TIME = 1_000_000_000
 """[s] since the epoch: a planted file has a time of its own, so that nothing takes it for the sound
@@ -85,18 +86,27 @@ class Copy:
         if not folder.is_dir():
             shutil.copytree(self._caches / 'sound', folder, copy_function=os.link)
             if fault.kernel:
-                kernels = {
-                    str(path.relative_to(self.root))
-                    for room in ROOMS
-                    for path in (self.root / room).rglob('*.py')
-                    if 'node_common.kernels import' in path.read_text()
-                }
-                for file in dependents(import_graph(self.root), fault.path, kernels):
-                    place = Path(file)
-                    name = cache_name(self.root, place.parent)
-                    for compiled in (folder / name).glob(f'{place.stem}.*'):
-                        compiled.unlink()
+                self._drop_affected(folder, number, fault)
         return folder
+
+    def _drop_affected(self, folder: Path, number: int, fault: Fault) -> None:
+        """Remove the kernels that a fault changes, and let Numba take the others of its file."""
+        sources = {
+            str(path.relative_to(self.root)): text
+            for room in ROOMS
+            for path in (self.root / room).rglob('*.py')
+            if 'node_common.kernels import' in (text := path.read_text())
+        }
+        stamp = float(_SCRATCH_TIME + number), len(fault.plant(sources[fault.path]).encode())
+        for file, names in affected_functions(sources, fault.function).items():
+            place = Path(file)
+            compiled = folder / cache_name(self.root, place.parent)
+            for index in compiled.glob(f'{place.stem}.*.nbi'):
+                name = index.name.removeprefix(f'{place.stem}.').partition('-')[0]
+                if name in names:
+                    index.unlink()
+                elif file == fault.path:
+                    _put_stamp(index, stamp)
 
     def run(
         self, tests: list[str], tier: str, number: int, fault: Fault | None, *options: str
@@ -169,6 +179,17 @@ def read_outcome(output: str, status: int, seconds: float) -> Outcome:
         test = started[-1].strip() if started else 'collection'
         return Outcome(test, seconds, timed_out=True)
     return Outcome(None if status in (0, 5) else f'pytest left with {status}', seconds)
+
+
+def _put_stamp(index: Path, stamp: tuple[float, int]) -> None:
+    """Write the time and size of a source into an index of Numba's: its lines are where they were.
+
+    As `IndexDataCacheFile` of `numba.core.caching` writes it.
+    """
+    with index.open('rb') as file:
+        version, (_, overloads) = pickle.load(file), pickle.loads(file.read())
+    index.unlink()  # a link to the sound one
+    index.write_bytes(pickle.dumps(version) + pickle.dumps((stamp, overloads)))
 
 
 def cache_name(root: Path, place: Path) -> str:

@@ -69,9 +69,29 @@ def distance(graph: dict[str, set[str]], start: str, end: str) -> int:
     return _FAR
 
 
-def dependents(graph: dict[str, set[str]], file: str, among: set[str]) -> set[str]:
-    """Return which files import a file, over others of `among`; and the file itself."""
-    found = {file}
-    while more := {f for f in among - found if graph[f] & found}:
-        found |= more
-    return found
+def affected_functions(sources: dict[str, str], function: str) -> dict[str, set[str]]:
+    """Return, by file, a function and all that name it, or name one that does; also by a constant.
+
+    Args:
+        sources: text by file.
+        function: name of the changed one.
+    """
+    named = [
+        (file, name, set(re.findall(r'\w+', ast.unparse(statement))))
+        for file, source in sources.items()
+        for statement in ast.parse(source).body
+        for name in defined_names(statement)
+    ]
+    affected, count = {function}, 0
+    while count < len(affected):
+        count = len(affected)
+        affected |= {name for _, name, words in named if words & affected}
+    return {file: {name for f, name, _ in named if f == file} & affected for file in sources}
+
+
+def defined_names(statement: ast.stmt) -> list[str]:
+    """Return the names that a statement of a module defines: of a function, or of constants."""
+    if isinstance(statement, ast.FunctionDef):
+        return [statement.name]
+    targets = statement.targets if isinstance(statement, ast.Assign) else []
+    return [n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
