@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 from meshes import box, irregular_box
+from pairs import EXPLICIT, every_pair
 
 from cutting_trainer.tissue_sim.contact.coupling import HOLD, PUSH, Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
-from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, Integrator, IntegratorName
+from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
 from cutting_trainer.tissue_sim.motion.stability import amplification, step_bound
 
-EXPLICIT = tuple(name for name in INTEGRATORS if name != 'implicit')
-every_integrator = pytest.mark.parametrize('integrator', INTEGRATORS)
 every_model = pytest.mark.parametrize('name', MODELS)
 
 
@@ -137,9 +136,8 @@ def grown_by(integrator: IntegratorName, name: ModelName, nu: float, share: floa
 
 
 @pytest.mark.long
-@every_model
+@every_pair
 @pytest.mark.parametrize('nu', [0.4, 0.499])
-@every_integrator
 def test_ten_thousand_steps_just_below_the_limit_decay_and_just_above_it_grow(
     integrator: IntegratorName, name: ModelName, nu: float
 ) -> None:
@@ -173,8 +171,7 @@ def held(integrator: IntegratorName, name: ModelName, mode: int) -> tuple[Dynami
     return dynamics, coupling
 
 
-@every_integrator
-@every_model
+@every_pair
 @pytest.mark.parametrize('mode', [PUSH, HOLD])
 def test_under_a_tool_all_come_to_the_same_rest(
     integrator: IntegratorName, name: ModelName, mode: int

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from meshes import box, irregular_box
+from pairs import every_explicit_pair, every_pair
 from test_blade import contact_at
 
 from cutting_trainer.cutting.method_registry import make_method
@@ -13,16 +14,14 @@ from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling, Tool
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
+from cutting_trainer.tissue_sim.elasticity.models import ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
-from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
-every_model = pytest.mark.parametrize('name', MODELS)
-every_integrator = pytest.mark.parametrize('integrator', INTEGRATORS)
 RESISTANCE = Resistance(100.0, 40.0, 0.0)
 
 
@@ -58,16 +57,14 @@ def press(tissue: TissueSimulation, frames: int, depth: float = 0.003) -> list[s
 
 
 @pytest.mark.long
-@every_integrator
-@every_model
+@every_pair
 def test_the_default_share_of_the_step_gives_no_trouble(
     name: ModelName, integrator: IntegratorName
 ) -> None:
     assert press(simulation(name, integrator), 10) == []
 
 
-@every_model
-@pytest.mark.parametrize('integrator', ['euler', 'symplectic_euler', 'rk4'])
+@every_explicit_pair
 def test_a_step_above_the_limit_is_caught_named_and_mended(
     name: ModelName, integrator: IntegratorName
 ) -> None:
@@ -83,8 +80,7 @@ def test_a_step_above_the_limit_is_caught_named_and_mended(
     )  # fmt: skip
 
 
-@every_integrator
-@every_model
+@every_pair
 def test_what_shorter_steps_do_not_mend_is_taken_back_with_no_force(
     name: ModelName, integrator: IntegratorName
 ) -> None:
@@ -189,8 +185,7 @@ def cut_block(name: ModelName, integrator: IntegratorName, method: str) -> Tissu
 
 
 @pytest.mark.long
-@every_integrator
-@every_model
+@every_pair
 def test_after_a_cut_through_elements_the_bound_holds_and_the_lips_come_to_rest(
     name: ModelName, integrator: IntegratorName
 ) -> None:
@@ -211,8 +206,7 @@ def test_after_a_cut_through_elements_the_bound_holds_and_the_lips_come_to_rest(
     assert energies[-1] < 0.5 * energies[0]
 
 
-@every_integrator
-@every_model
+@every_pair
 def test_an_inverted_element_does_not_blow_up(name: ModelName, integrator) -> None:
     tissue = simulation(name, integrator)
     mesh = tissue.mesh
@@ -227,8 +221,7 @@ def test_an_inverted_element_does_not_blow_up(name: ModelName, integrator) -> No
 
 
 @pytest.mark.long
-@every_integrator
-@every_model
+@every_pair
 def test_a_tool_that_jumps_through_the_tissue_is_not_believed(
     name: ModelName, integrator: IntegratorName
 ) -> None:
@@ -247,8 +240,7 @@ def test_a_tool_that_jumps_through_the_tissue_is_not_believed(
         assert not frame.diverged or (frame.trouble and not frame.force.any())
 
 
-@every_integrator
-@every_model
+@every_pair
 def test_near_incompressibility_only_shortens_the_step(
     name: ModelName, integrator: IntegratorName
 ) -> None:
@@ -267,6 +259,7 @@ def test_energy_from_nowhere_is_found_before_it_is_large() -> None:
     assert 'farther' in guard.diagnose(u, np.nan, 0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('active', [ActiveSettings(), ActiveSettings('on')], ids=['all', 'region'])
 def test_a_loose_piece_that_is_pushed_away_stops_and_the_rest_goes_on(
     active: ActiveSettings,
