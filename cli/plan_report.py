@@ -9,13 +9,11 @@ from rich.markup import escape
 
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.scene_loader import load_scene
-from cutting_trainer.tissue_sim.assembly import make_task
+from cutting_trainer.tissue_sim.assembly import make_plan, make_task
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost
-from cutting_trainer.tissue_sim.planner.method_errors import model_errors
-from cutting_trainer.tissue_sim.planner.plan import Plan, plan
-from cutting_trainer.tissue_sim.planner.rejection_reasons import inaccurate, ms, percent
+from cutting_trainer.tissue_sim.planner.plan import Plan
+from cutting_trainer.tissue_sim.planner.rejection_reasons import ms, percent
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
-from cutting_trainer.tissue_sim.warm_up import warm_up
 
 
 def run_plan(scene: str, *, as_json: bool = False) -> Status:
@@ -32,9 +30,9 @@ def run_plan(scene: str, *, as_json: bool = False) -> Status:
         SessionError, SceneError, MeshError: the scene cannot be used.
     """
     settings = load_scene(scene).tissue
-    with Console(stderr=True).status('loading kernels', refresh_per_second=1) as shown:
-        warm_up()  # a kernel that is loaded meanwhile would count as cost
-        found = plan(make_task(settings), shown.update)
+    beside = Console(stderr=True, soft_wrap=True, highlight=False)
+    with beside.status('loading kernels', refresh_per_second=1) as shown:
+        found = make_plan(make_task(settings), beside.print, shown.update)
     console = Console(soft_wrap=True, highlight=False)
     if as_json:
         console.out(json.dumps(as_data(scene, settings, found), indent=2), highlight=False)
@@ -46,11 +44,11 @@ def run_plan(scene: str, *, as_json: bool = False) -> Status:
 
 def report(scene: str, settings: TissueSettings, found: Plan) -> list[str]:
     """Return the lines that are printed."""
-    b, task = settings.budget, found.task
+    b = settings.budget
     lines = [
         f'{scene}: {found.tetrahedra} tetrahedra, {"cut" if b.cuts else "not cut"}',
         f'  asked: up to {1e3 * b.displacement:g} mm and {b.rotation:g} degrees, error at most '
-        f'{100 * b.error:g} %, {ms(task.available)} a frame at {task.stepping.rate:g} Hz '
+        f'{100 * b.error:g} %, {ms(found.available)} a frame at {settings.integration.rate:g} Hz '
         f'({b.cores:g} cores)',
     ]
     if found.chosen is not None:
@@ -68,13 +66,7 @@ def report(scene: str, settings: TissueSettings, found: Plan) -> list[str]:
 
 def _chosen(chosen: Candidate, found: Plan) -> list[str]:
     cost, worst, errors = chosen.cost, found.worst, chosen.errors
-    causes = {
-        'by the size of the elements': errors.elements,
-        'by large deformation': errors.large,
-        'by the step': errors.time,
-        'by nodes that are held': errors.region,
-    }
-    said = [f'{percent(value)} {cause}' for cause, value in causes.items() if value > 0.0]
+    said = [f'{percent(value)} {cause}' for cause, value in errors.causes.items()]
     lines = [
         f'taken: {chosen.name}',
         f'  error {percent(errors.total)}: {", ".join(said)}',
@@ -112,10 +104,7 @@ def _why_not(settings: TissueSettings, found: Plan) -> str:
     for rejection in found.rejected:
         if rejection.method in (settings.model, _name(settings)):
             return rejection.why if rejection.fails else ''
-    errors = model_errors(settings.model, found.probing, settings.budget)
-    if errors.total <= settings.budget.error:
-        return ''
-    return inaccurate(settings.model, errors, settings.budget).why
+    return found.own
 
 
 def _name(settings: TissueSettings) -> str:
@@ -145,7 +134,7 @@ def as_data(scene: str, settings: TissueSettings, found: Plan) -> dict[str, Any]
         'scene': scene,
         'tetrahedra': found.tetrahedra,
         'budget': settings.budget.model_dump(),
-        'available': found.task.available,
+        'available': found.available,
         'chosen': chosen,
         'rejected': [r._asdict() for r in found.rejected],
         'remedies': list(found.remedies),

@@ -3,6 +3,7 @@
 import json
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from meshes import box
@@ -14,11 +15,13 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation, make_task
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 from cutting_trainer.tissue_sim.planner.budget import Budget
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost, ErrorEstimate, Task
-from cutting_trainer.tissue_sim.planner.frame_cost import frame_cost, with_regions
+from cutting_trainer.tissue_sim.planner.far_field_choice import far_field
+from cutting_trainer.tissue_sim.planner.frame_cost import frame_cost
+from cutting_trainer.tissue_sim.planner.indentation import places
+from cutting_trainer.tissue_sim.planner.memory import recall, remember
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
 
 pytestmark = pytest.mark.long
@@ -75,7 +78,7 @@ def test_the_predicted_error_is_not_exceeded_by_quadratic_elements(plans: dict[s
     """At a place of its own, one of the scene's script, and as deep as the budget says."""
     found = plans['palpation']
     assert found.chosen is not None
-    task = found.task
+    task = task_on_a_core('palpation')
     presses = script_presses(load_scene('palpation'), task)[:1]
     exact = QuadraticTissue(task.mesh, task.material)
     assert 0.0 < settlement_error(task, found.chosen, presses, exact) < found.chosen.errors.elements
@@ -100,7 +103,7 @@ def test_after_a_cut_the_plan_is_held_against_what_the_step_costs_now(
     assert found.chosen is not None
     cost = found.chosen.cost
     assert found.over(cost.substeps, found.tetrahedra) == ''
-    many = 10 * found.task.available / (cost.each or cost.frame)
+    many = 10 * found.available / (cost.each or cost.frame)
     assert 'needs' in found.over(many, found.tetrahedra) or cost.each == 0
 
 
@@ -127,8 +130,10 @@ def test_the_report_says_what_is_taken_and_why_nothing_less_and_so_does_the_json
     assert data['chosen']['model'] == 'corotational_smoothed'
     errors = data['chosen']['errors']
     assert errors['total'] == pytest.approx(
-        errors['elements'] + errors['strain'] + errors['time'] + errors['region']
+        sum(errors[cause] for cause in ('elements', 'contact', 'strain', 'time', 'region'))
     )
+    said = next(line for line in lines if line.startswith('  error '))
+    assert said.count(' % by ') == 5  # each cause, those of no size too
     assert data['chosen']['cost']['frame'] <= data['available']
     lesser = next(r for r in data['rejected'] if r['method'] == 'linear')
     assert lesser['fails'] and '45 degrees' in lesser['why']
@@ -159,23 +164,62 @@ def test_what_else_the_machine_does_during_a_stroke_is_not_counted_as_cost(
     for busy in (False, True):
         clock[1] = 0
         monkeypatch.setattr(time, 'thread_time', lambda busy=busy: tick(busy))
-        costs.append(frame_cost(task, 'linear', integrator).frame)
+        costs.append(frame_cost(task, 'linear', integrator, 0.001).frame)
     assert costs[1] == pytest.approx(costs[0])
 
 
-def test_a_region_of_few_nodes_makes_a_large_tissue_cheaper_and_its_error_is_counted() -> None:
-    nodes, tets = box((30, 6, 6), 0.005)
+def far_task(error: float) -> tuple[Task, Candidate]:
+    """A slab with a method, and time enough on any machine."""
+    nodes, tets = box((14, 14, 6), 0.006)
+    budget = Budget(displacement=0.002, contact_radius=0.01, error=error, cuts=False, cores=1.0)
+    task = make_task(load_scene('palpation').tissue)
     task = replace(
-        make_task(load_scene('palpation').tissue),
+        task,
+        stepping=replace(task.stepping, rate=2.0, max_substeps=10_000),
         mesh=TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
-        budget=Budget(displacement=0.002, contact_radius=0.01),
+        budget=budget,
     )
-    cost = Cost(20, 1e-3, 0.0, 1e-3)
-    whole = Candidate(
-        'corotational_smoothed', 'symplectic_euler', ErrorEstimate(0.1, 0.0, 0.0), cost
+    at_rest = ErrorEstimate(0.1, 0.0, 0.0)
+    return task, Candidate('linear_smoothed', 'symplectic_euler', at_rest, Cost(20, 1e-3, 1.0, 0))
+
+
+def test_a_far_field_has_the_fewest_nodes_that_are_accurate_enough() -> None:
+    found = []
+    for allowed in (0.35, 0.14):
+        task, whole = far_task(allowed)
+        indenter = places(task.mesh, 0.01, 1)[0]
+        chosen, others = far_field(task, whole, indenter, 0.002, lambda text: None)
+        assert chosen is not None and chosen.errors.total <= allowed
+        assert all('by far nodes that move together' in other.why for other in others)
+        found.append(chosen)
+    coarse, fine = found
+    assert coarse.active.nodes < fine.active.nodes
+    assert coarse.errors.region > fine.errors.region > 0
+
+
+def test_a_plan_is_remembered_and_made_anew_where_its_file_is_damaged_or_anything_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plans: dict[str, Plan]
+) -> None:
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
+    task, found = task_on_a_core('palpation'), plans['palpation']
+    said: list[str] = []
+    assert recall(task, said.append) is None
+    remember(task, found)
+    assert recall(task, said.append) == found
+    assert len(said) == 1 and 'planned anew' in said[0]
+    moved = TetMesh(task.mesh.rest * 1.000001, task.mesh.tetrahedra, task.mesh.fixed == 1)
+    softer = replace(task.material, youngs_modulus=4999.0)
+    budget = task.budget.model_copy(update={'error': 0.36})
+    others = (
+        replace(task, mesh=moved),
+        replace(task, material=softer),
+        replace(task, budget=budget),
+        replace(task, model='corotational'),
     )
-    regions = [ActiveSettings('budget', nodes) for nodes in (60, 800)]
-    few, more = with_regions(task, whole, regions)
-    assert few.cost.frame < more.cost.frame
-    assert few.errors.region > more.errors.region > 0
-    assert few.errors.total == pytest.approx(0.1 + few.errors.region)
+    assert [recall(other, said.append) for other in others] == [None] * 4
+    (file,) = (tmp_path / 'plans').iterdir()
+    whole = file.read_bytes()
+    for damaged in (whole[:-5], whole.replace(b'linear', b'linaer'), b'', b'\xff' * 100):
+        file.write_bytes(damaged)
+        assert recall(task, said.append) is None
+        assert str(file) in said[-1] and 'planned anew' in said[-1]

@@ -1,5 +1,7 @@
 """What the planner expects of meshes and models: no clock decides here."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from meshes import box, irregular_box
@@ -7,14 +9,15 @@ from meshes import box, irregular_box
 from bench.accuracy.problems import LargeRotation
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
-from cutting_trainer.tissue_sim.elasticity.hyperelastic import neo_hookean
+from cutting_trainer.tissue_sim.elasticity.hyperelastic import law_stress
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.refine import refined
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.planner.budget import Budget
+from cutting_trainer.tissue_sim.planner.contact_errors import contact_error, curvature
 from cutting_trainer.tissue_sim.planner.deep_indentation import indent
-from cutting_trainer.tissue_sim.planner.indentation import places, settlement
+from cutting_trainer.tissue_sim.planner.indentation import Indenter, places, settlement
 from cutting_trainer.tissue_sim.planner.mesh_errors import Probing, Strains
 from cutting_trainer.tissue_sim.planner.method_errors import errors_at_rest, time_error
 
@@ -86,7 +89,7 @@ def test_a_linear_model_is_charged_with_one_minus_the_cosine() -> None:
     nodes, tets = box((2, 2, 2), 0.01)
     mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
     strains = Strains(mesh, GEL, places(mesh, 0.01, 1)[0], 1e-4)
-    probing = Probing({False: 0.1, True: 0.05}, strains, 30.0)
+    probing = Probing({False: 0.1, True: 0.05}, 0.02, strains, 1e-3, 30.0)
     budget = Budget(rotation=30.0)
     assert errors_at_rest('linear', probing, budget).rotation == pytest.approx(0.134, abs=1e-3)
     assert errors_at_rest('corotational', probing, budget).rotation == 0.0
@@ -94,7 +97,7 @@ def test_a_linear_model_is_charged_with_one_minus_the_cosine() -> None:
     assert smoothed.elements < errors_at_rest('linear', probing, budget).elements
 
 
-def test_a_neo_hookean_block_that_is_stretched_and_sheared_has_the_stress_of_its_formula() -> None:
+def test_a_block_that_is_stretched_and_sheared_has_the_stress_of_its_formula() -> None:
     lam, mu = 3000.0, 1500.0
     stretch = np.diag([1.3, 0.9, 0.8])
     shear = np.eye(3)
@@ -102,7 +105,7 @@ def test_a_neo_hookean_block_that_is_stretched_and_sheared_has_the_stress_of_its
     angle = 0.9
     turn = np.eye(3)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    stress, change = neo_hookean(np.array([stretch, shear, turn]), lam, mu)
+    stress, _ = law_stress(np.array([stretch, shear, turn]), lam, mu)
     sides = np.diag(stretch)
     principal = mu * (sides - 1 / sides) + lam * np.log(sides.prod()) / sides
     np.testing.assert_allclose(stress[0], np.diag(principal), atol=1e-9)
@@ -110,9 +113,11 @@ def test_a_neo_hookean_block_that_is_stretched_and_sheared_has_the_stress_of_its
     np.testing.assert_allclose((stress[1] @ shear.T)[0, 1], mu * 0.7, rtol=1e-12)
     np.testing.assert_allclose(stress[2], 0.0, atol=1e-9)
     way, size = np.random.default_rng(3).normal(size=(3, 3)), 1e-6
-    ahead, behind = (neo_hookean((shear + s * way)[None], lam, mu)[0] for s in (size, -size))
-    slope = np.einsum('bpaj,aj->bp', change[1], way)
-    np.testing.assert_allclose((ahead - behind)[0] / (2 * size), slope, rtol=1e-5, atol=1e-3)
+    for b in (0.0, 6.0):
+        change = law_stress(shear[None], lam, mu, b)[1]
+        ahead, behind = (law_stress((shear + s * way)[None], lam, mu, b)[0] for s in (size, -size))
+        slope = np.einsum('bpaj,aj->bp', change[0], way)
+        np.testing.assert_allclose((ahead - behind)[0] / (2 * size), slope, rtol=1e-5, atol=1e-3)
 
 
 @pytest.fixture(scope='module')
@@ -124,7 +129,7 @@ def block() -> TetMesh:
 def test_a_shallow_dent_is_linear_and_a_deep_one_errs_the_more_the_deeper(block: TetMesh) -> None:
     press = places(block, 0.015, 1)[0]
     shallow, deep, deeper = (
-        indent(block, GEL, press, depth).error(rotating=False) for depth in (1e-5, 0.004, 0.008)
+        indent(block, GEL, press, depth).error('linear') for depth in (1e-5, 0.004, 0.008)
     )
     assert shallow < 2e-3
     assert 10 * shallow < deep < deeper
@@ -138,5 +143,28 @@ def test_in_a_deep_dent_the_prediction_covers_what_finer_quadratic_elements_find
     soft = settlement(ElasticModel(block, GEL, 'linear_smoothed'), press.load(block))[0]
     wrong = abs(0.7534 * soft / 0.006 - 1)
     found = indent(block, GEL, press, 0.006)
-    assert 0.14 < wrong < found.error(rotating=False) < 0.2
-    assert abs(found.whole.error(rotating=False)) < wrong / 2
+    assert 0.14 < wrong < found.error('linear') < 0.2
+    assert abs(found.whole.error('linear')) < wrong / 2
+
+
+def test_a_stiffening_model_errs_by_its_tolerance_alone_and_a_linear_one_by_the_law(
+    block: TetMesh,
+) -> None:
+    found = indent(block, replace(GEL, stiffening=6.0), places(block, 0.015, 1)[0], 0.006)
+    assert 0.0 < found.error('law') < 0.04
+    assert found.error('linear') > 0.3
+
+
+def test_the_contact_errs_where_the_footprint_is_wider_than_it_should_be_or_the_surface_curved(
+    block: TetMesh,
+) -> None:
+    wide, narrow = (
+        contact_error(block, GEL, places(block, radius, 1)[0], 0.003) for radius in (0.02, 0.01)
+    )
+    assert wide < 1e-3 < narrow < 0.1
+    nodes, tets = box((10, 10, 2), 0.004)
+    dome = nodes - [0.02, 0.02, 0.0]
+    dome[:, 2] -= np.square(dome[:, :2]).sum(axis=1) / (2 * 0.1) * dome[:, 2] / 0.008
+    mesh = TetMesh(dome, tets, nodes[:, 2] < 1e-9)
+    press = Indenter(np.array([0.0, 0.0, 0.008]), 0.006, np.array([0.0, 0.0, -1.0]))
+    assert curvature(mesh, press) == pytest.approx(1 / 0.1, rel=0.1)

@@ -1,5 +1,6 @@
 """Assembly of a tissue simulation from the section `tissue` of a scene."""
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -15,10 +16,11 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.planner.candidate import Task
+from cutting_trainer.tissue_sim.planner.memory import recall, remember
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
 from cutting_trainer.tissue_sim.scene_schema import ActiveRegionSettings, TissueSettings
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
-from cutting_trainer.tissue_sim.warm_up import warm_up, warm_up_method
+from cutting_trainer.tissue_sim.warm_up import warm_up, warm_up_method, warm_up_models
 
 
 def load_tissue(
@@ -67,11 +69,35 @@ def make_task(settings: TissueSettings, mesh: TetMesh | None = None) -> Task:
             max_substeps=i.max_substeps,
             frequency_growth=i.frequency_growth,
         ),
+        settings.model,
     )
 
 
+def make_plan(
+    task: Task,
+    note: Callable[[str], None] = lambda text: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Plan:
+    """Return the plan for a scene: that of an earlier start, or a new one, which is kept.
+
+    Args:
+        task: the scene.
+        note: gets one sentence if the plan is made anew.
+        say: gets what is measured next.
+    """
+    known = recall(task, note)
+    if known is not None:
+        return known
+    warm_up()  # a kernel that is loaded meanwhile would count as cost
+    found = plan(task, say)
+    remember(task, found)
+    return found
+
+
 def make_simulation(
-    settings: TissueSettings, before: MeshReplica | None = None
+    settings: TissueSettings,
+    before: MeshReplica | None = None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> tuple[TissueSimulation, Plan | None]:
     """Return the simulation of a scene, and its plan if the scene asks for one.
 
@@ -80,17 +106,19 @@ def make_simulation(
     Args:
         settings: its section `tissue`.
         before: state of the tissue in an earlier simulation of this scene, to continue from.
+        note: gets one sentence if a plan is made anew, and what is measured for it.
 
     Raises:
         MeshError: the mesh is not valid, or has no shape at rest under its weight.
     """
     # This comes first, see there.
-    warm_up() if settings.method == 'auto' else warm_up_method(settings.integrator)
+    warm_up_models() if settings.method == 'auto' else warm_up_method(settings.integrator)
     # A cut mesh has coincident nodes, which the checks of a scene's mesh refuse.
     mesh = None if before is None else before.mesh()
     task = make_task(settings, None if settings.method == 'auto' else mesh)
-    found = plan(task) if settings.method == 'auto' else None
+    found = make_plan(task, note, note) if settings.method == 'auto' else None
     taken = as_planned(settings, found)
+    warm_up_method(taken.integrator)
     simulation = TissueSimulation(
         mesh or task.mesh,
         task.material,

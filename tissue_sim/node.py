@@ -82,7 +82,7 @@ class TissueSimNode(ManagedNode):
         self._file = Path(file) if file else None
         before = self._tissue_before() if self._resumes else None
         self._checkpoint = Checkpoint(self._file) if self._file else None
-        self._simulation, plan = make_simulation(settings, before)
+        self._simulation, plan = make_simulation(settings, before, self.get_logger().info)
         self._plan = None if plan is None else PlanMonitor(plan, self._simulation)
         self._log_plan()
         self._announce_method(as_planned(settings, plan))

@@ -1,6 +1,6 @@
 """Quadratic tetrahedra of scikit-fem: the reference for plans.
 
-Shape functions, quadrature and loads are scikit-fem's; in a deep dent the tissue is neo-Hookean.
+Shape functions, quadrature and loads are scikit-fem's; in a deep dent the tissue is hyperelastic.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, splu
 from skfem.models.elasticity import linear_elasticity
 
-from cutting_trainer.tissue_sim.elasticity.hyperelastic import NeoHookean, Points
+from cutting_trainer.tissue_sim.elasticity.hyperelastic import Hyperelastic, Points
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.planner.indentation import Indenter
@@ -71,7 +71,7 @@ class QuadraticTissue:
         return np.asarray(u[self._basis.nodal_dofs].T)
 
     def force(self, press: Indenter, depth: float, steps: int = 8) -> float:
-        """Return the force that presses the neo-Hookean tissue to a depth [N].
+        """Return the force that presses the hyperelastic tissue to a depth [N].
 
         Args:
             press: where.
@@ -82,7 +82,7 @@ class QuadraticTissue:
             MeshError: no equilibrium was found.
         """
         solve = LinearOperator(self._factors.shape, self._factors.solve)
-        tissue = NeoHookean([self._points()], self._free, solve)
+        tissue = Hyperelastic([self._points()], self._free, solve)
         return tissue.press(self.load(press), depth, steps)[0]
 
     def _points(self) -> Points:
@@ -101,4 +101,5 @@ class QuadraticTissue:
         shape = (9 * count * quadrature, basis.N)
         gradient = csr_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
         lame = (self._material.lame_lambda, self._material.lame_mu)
-        return Points(gradient, np.asarray(scalar.dx).ravel(), lame)
+        weight = np.asarray(scalar.dx).ravel()
+        return Points(gradient, weight, lame, self._material.stiffening)

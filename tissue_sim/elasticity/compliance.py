@@ -4,7 +4,7 @@ import numpy as np
 
 from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, stiffness_product
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, stiffness_product
 from cutting_trainer.tissue_sim.mesh.adjacency import PATCH, spans_of, without
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
 
@@ -129,6 +129,32 @@ def solve_static(
         f'no equilibrium: {left:.1e} of the load is left, {tolerance:.1e} is asked for; is every '
         'part of the tissue held by fixed nodes?'
     )
+
+
+def solve_within(
+    operands: Operands,
+    spans: np.ndarray,
+    diagonal: np.ndarray,
+    load: np.ndarray,
+    tolerance: float = 1e-6,
+) -> np.ndarray:
+    """Return the displacement of a linear part under constant forces, all others held.
+
+    Args:
+        operands: of the part, such as those of a far field with its unknowns.
+        spans: intervals of its nodes and unknowns, shape (s, 2).
+        diagonal: of the stiffness, 0 where a coordinate cannot move [N/m], shape (c,).
+        load: forces [N], shape (c,).
+        tolerance: of the residual, relative to the load.
+
+    Returns:
+        [m], shape (c,); 0 outside of the spans.
+    """
+    preconditioner = _diagonal_preconditioner(diagonal, diagonal > 0.0)
+    x, work = np.zeros_like(load), np.zeros((3, len(load)))
+    least = float(preconditioner @ np.square(load)) * tolerance**2
+    _patch_gradients(operands, spans, preconditioner, load, x, work, _MAX_ITERATIONS, least)
+    return x
 
 
 def _diagonal_preconditioner(diagonal: np.ndarray, free: np.ndarray) -> np.ndarray:

@@ -1,9 +1,10 @@
-"""Neo-Hookean tissue in static equilibrium: the reference for the planner's error estimates.
+"""Hyperelastic tissue in static equilibrium: the reference for the planner's error estimates.
 
-Its energy by volume is mu/2 (|F|^2 - 3) - mu ln J + lambda/2 (ln J)^2 (Bonet and Wood 2008, 6.28):
-linear elasticity where strains are small, right for any rotation, and no volume ever vanishes.
-The trainer's own models are linear in strain, also the corotational ones, and collapse under
-deep indentation.
+Its energy by volume is that of the law that stiffens (docs/method.md), at every point, however
+small the strain: mu/(2b) (exp(b x) - 1) + lambda/2 (ln J)^2 with x = |F|^2 - 3 - 2 ln J; for b = 0
+neo-Hookean (Bonet and Wood 2008, 6.28). It is linear elasticity where strains are small, right for
+any rotation, and no volume ever vanishes. Models that are linear in strain, also the corotational
+ones, collapse under deep indentation.
 """
 
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import PLAIN_SHARE
 from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import NodalSmoothing
+from cutting_trainer.tissue_sim.elasticity.stiffening import MAX_EXPONENT
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 Floats = NDArray[np.float64]
@@ -36,11 +38,13 @@ class Points(NamedTuple):
         gradient: displacement by coordinate to its gradients [1/m], shape (9 k, 3 n).
         weight: volumes [m^3], shape (k,).
         lame: lambda and mu [Pa].
+        stiffening: b of the law.
     """
 
     gradient: csr_matrix
     weight: Floats
     lame: tuple[float, float]
+    stiffening: float = 0.0
 
 
 def smoothed_points(mesh: TetMesh, material: Material) -> list[Points]:
@@ -48,7 +52,7 @@ def smoothed_points(mesh: TetMesh, material: Material) -> list[Points]:
 
     A share of mu is evaluated in elements, the rest averaged over nodes.
     """
-    lam, mu = material.lame_lambda, material.lame_mu
+    lam, mu, b = material.lame_lambda, material.lame_mu, material.stiffening
     domains = NodalSmoothing(mesh, lam, (1 - PLAIN_SHARE) * mu).operands
     rows = np.repeat(np.arange(mesh.node_count), domains.used)
     slots = np.repeat(domains.start - np.cumsum(domains.used) + domains.used, domains.used)
@@ -61,9 +65,10 @@ def smoothed_points(mesh: TetMesh, material: Material) -> list[Points]:
     shapes = np.concatenate([-inner.sum(axis=1, keepdims=True), inner], axis=1)
     rows = np.repeat(np.arange(len(tets)), 4)
     plain = _gradient(rows, tets.ravel(), shapes.reshape(-1, 3), len(tets), mesh)
+    volume = domains.volume[: mesh.node_count].copy()
     return [
-        Points(averaged, domains.volume[: mesh.node_count].copy(), (lam, (1 - PLAIN_SHARE) * mu)),
-        Points(plain, mesh.volumes(), (0.0, PLAIN_SHARE * mu)),
+        Points(averaged, volume, (lam, (1 - PLAIN_SHARE) * mu), b),
+        Points(plain, mesh.volumes(), (0.0, PLAIN_SHARE * mu), b),
     ]
 
 
@@ -78,8 +83,8 @@ def _gradient(
     return csr_matrix((vectors[:, j].ravel(), (at.ravel(), columns.ravel())), shape=shape)
 
 
-class NeoHookean:
-    """Neo-Hookean tissue under an indenting load.
+class Hyperelastic:
+    """Hyperelastic tissue under an indenting load.
 
     Args:
         points: points whose energies add up.
@@ -154,7 +159,7 @@ class NeoHookean:
         """
         internal, parts = np.zeros_like(u), []
         for p, transposed in zip(self._points, self._transposed, strict=True):
-            stress, change = neo_hookean(self._deformation(p, u), *p.lame)
+            stress, change = law_stress(self._deformation(p, u), *p.lame, p.stiffening)
             internal += transposed @ (p.weight[:, None, None] * stress).ravel()
             change *= p.weight[:, None, None, None, None]
             parts.append((p.gradient, change.reshape(-1, 9, 9), transposed))
@@ -172,12 +177,15 @@ class NeoHookean:
         return internal, LinearOperator((size, size), matvec=product, dtype=float)
 
 
-def neo_hookean(gradient: Floats, lam: float, mu: float) -> tuple[Floats, Floats]:
+def law_stress(
+    gradient: Floats, lam: float, mu: float, stiffening: float = 0.0
+) -> tuple[Floats, Floats]:
     """Return the first Piola-Kirchhoff stress and its derivative.
 
     Args:
         gradient: of the deformation, F, shape (k, 3, 3).
         lam, mu: Lame coefficients [Pa].
+        stiffening: b of the law; 0: neo-Hookean.
 
     Returns:
         P [Pa], shape (k, 3, 3), and dP/dF, shape (k, 3, 3, 3, 3).
@@ -185,9 +193,15 @@ def neo_hookean(gradient: Floats, lam: float, mu: float) -> tuple[Floats, Floats
     inverse = np.linalg.inv(gradient)
     turned = np.swapaxes(inverse, 1, 2)
     logarithm = np.log(np.linalg.det(gradient))[:, None, None]
-    stress = mu * (gradient - turned) + lam * logarithm * turned
-    change = (mu - lam * logarithm)[..., None, None] * np.einsum(
+    sheared = gradient - turned
+    x = np.square(gradient).sum(axis=(1, 2)) - 3 - 2 * logarithm[:, 0, 0]
+    stiff = (mu * np.exp(np.minimum(stiffening * x, MAX_EXPONENT)))[:, None, None]
+    stress = stiff * sheared + lam * logarithm * turned
+    change = (stiff - lam * logarithm)[..., None, None] * np.einsum(
         'kpa,kjb->kbpaj', inverse, inverse
     ) + lam * np.einsum('kpb,kja->kbpaj', inverse, inverse)
-    change += mu * np.einsum('ba,pj->bpaj', np.eye(3), np.eye(3))
+    change += np.einsum('kpq,ba,pj->kbpaj', stiff, np.eye(3), np.eye(3))
+    if stiffening > 0.0:
+        steeper = 2 * stiffening * stiff[:, 0, 0] * (stiffening * x < MAX_EXPONENT)
+        change += np.einsum('k,kbp,kaj->kbpaj', steeper, sheared, sheared)
     return stress, change

@@ -67,9 +67,6 @@ ModelName = Literal[
     'linear', 'linear_smoothed', 'corotational', 'corotational_smoothed', 'stiffening'
 ]
 MODELS: tuple[ModelName, ...] = get_args(ModelName)
-PLANNED_MODELS: tuple[ModelName, ...] = tuple(name for name in MODELS if name != 'stiffening')
-"""Models that a plan chooses from: it has no estimate of what stiffening costs and gains."""
-
 PLAIN_SHARE = 0.3
 """Part of the shear stiffness that smoothed models leave to the elements.
 

@@ -22,7 +22,8 @@ class ErrorEstimate:
         rotation: largest rotation, for models without rotations.
         strain: largest displacement, for the model's strain measure.
         time: step size, at the pace of a palpating hand.
-        region: nodes that do not move on their own.
+        region: far nodes that move together.
+        contact: footprint of the tool.
     """
 
     elements: float
@@ -30,6 +31,7 @@ class ErrorEstimate:
     strain: float
     time: float = 0.0
     region: float = 0.0
+    contact: float = 0.0
 
     @property
     def large(self) -> float:
@@ -37,9 +39,20 @@ class ErrorEstimate:
         return max(self.rotation, self.strain)
 
     @property
+    def causes(self) -> dict[str, float]:
+        """Error by cause, as a phrase, all that add up."""
+        return {
+            'by the size of the elements': self.elements,
+            'by the footprint of the tool': self.contact,
+            'by large deformation': self.large,
+            'by the step': self.time,
+            'by far nodes that move together': self.region,
+        }
+
+    @property
     def total(self) -> float:
         """Total of all causes."""
-        return self.elements + self.large + self.time + self.region
+        return sum(self.causes.values())
 
 
 @dataclass(frozen=True)
@@ -97,6 +110,7 @@ class Task:
         mesh, material, resistance: the tissue.
         budget: the requirements.
         stepping: of the scene; its integrator is ignored.
+        model: of the scene.
     """
 
     mesh: TetMesh
@@ -104,6 +118,7 @@ class Task:
     resistance: Resistance
     budget: Budget
     stepping: TimeStepping
+    model: ModelName = 'linear_smoothed'
 
     @property
     def available(self) -> float:

@@ -1,12 +1,13 @@
-"""Errors of the models under deep indentation, against a neo-Hookean tissue.
+"""Errors of the models under deep indentation, against a hyperelastic tissue.
 
 The scene's own mesh does not resolve an indentation no wider than an element, and a small region
-does not show the bending of the whole. Both are therefore computed: the whole tissue on its mesh,
-and the elements nearest to the tool, as they are and each split into eight. One refinement does not
+does not show the bending of the whole. Both are therefore computed: the tissue on its mesh, and the
+elements nearest to the tool, as they are and each split into eight. One refinement does not
 converge: elements of half the size yield more, and those of a quarter more still.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +15,28 @@ from numpy.typing import NDArray
 from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium, preconditioner
-from cutting_trainer.tissue_sim.elasticity.hyperelastic import NeoHookean, smoothed_points
+from cutting_trainer.tissue_sim.elasticity.hyperelastic import Hyperelastic, smoothed_points
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
+from cutting_trainer.tissue_sim.elasticity.models import (
+    STRAIN_TOLERANCE,
+    ElasticModel,
+    ModelName,
+)
 from cutting_trainer.tissue_sim.mesh.refine import refined
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.planner.indentation import Indenter, settlement
+from cutting_trainer.tissue_sim.planner.indentation import Indenter, settlement, surroundings
 
 Floats = NDArray[np.float64]
+
+StrainName = Literal['linear', 'rotating', 'law']
+"""Strains of a model: linear ones, those of elements that rotate, those of a law."""
 
 _WIDE = 3.0
 """Radius of the surrounding region, in radii of the indenter, unless it has too many elements."""
 _NEAR = 500
 """Largest number of elements in the surroundings, before they are split."""
+_NEWTON = 12
+"""Newton steps for a part of the load, after which a model is said to give way."""
 _STEPS = (4, 12)
 """Load steps to the depth: first attempt, and second if there is no equilibrium."""
 
@@ -38,8 +48,9 @@ class MeshIndentation:
     Attributes:
         mesh, material: the tissue, or a part of it.
         load: of 1 N [N], shape (n, 3).
-        depth: of the neo-Hookean tissue [m].
+        depth: of the hyperelastic tissue [m].
         force: at that depth [N].
+        moved: its displacement at that depth [m], shape (n, 3).
         part: ratio of this depth to the whole settlement [-].
     """
 
@@ -48,15 +59,25 @@ class MeshIndentation:
     load: Floats
     depth: float
     force: float
+    moved: Floats
     part: float
 
-    def error(self, rotating: bool) -> float:
+    def error(self, strains: StrainName) -> float:
         """Return the relative error of the settlement by a model's strain, signed; infinite if it
         collapses.
 
         Args:
-            rotating: whether the model's elements rotate. Smoothed ones stand for plain ones.
+            strains: of the model.
         """
+        if strains == 'law':
+            # To the first order: the work of the forces that it lacks, over that of the load.
+            everywhere, blended = (
+                ElasticModel(self.mesh, self.material, 'stiffening', tolerance).force(self.moved)
+                for tolerance in (0.0, STRAIN_TOLERANCE)
+            )
+            lacking = float(np.sum((everywhere - blended) * self.moved))
+            return self.part * lacking / (self.force * self.depth)
+        rotating = strains == 'rotating'
         name: ModelName = 'corotational_smoothed' if rotating else 'linear_smoothed'
         model = ElasticModel(self.mesh, self.material, name)
         load = self.force * self.load
@@ -65,7 +86,7 @@ class MeshIndentation:
         u = np.zeros_like(load)
         try:
             for share in (0.25, 0.5, 0.75, 1.0):
-                u = equilibrium(model, share * load, start=u, tolerance=1e-4, iterations=25)
+                u = equilibrium(model, share * load, start=u, tolerance=1e-3, iterations=_NEWTON)
         except MeshError:
             return float('inf')
         return self._error(u)
@@ -79,7 +100,7 @@ class DeepIndentation:
     """The same indentation of the whole tissue and of its surroundings.
 
     Attributes:
-        whole: on the mesh of the scene.
+        whole: on the mesh of the scene, or the `WHOLE` elements nearest to the press.
         near, finer: of the elements around the press, and of those each split into eight.
         steepness: depth of the local indentation over its radius [-], without the deflection of the
             whole.
@@ -90,7 +111,7 @@ class DeepIndentation:
     finer: MeshIndentation
     steepness: float
 
-    def error(self, rotating: bool) -> float:
+    def error(self, strains: StrainName, enough: float = np.inf) -> float:
         """Return the largest relative error of the settlement by a model's strain; infinite if it
         collapses.
 
@@ -98,10 +119,21 @@ class DeepIndentation:
         in the limit: a change that halves with the element size is as large again.
 
         Args:
-            rotating: whether the model's elements rotate.
+            strains: of the model.
+            enough: error from which on that of the surroundings will do: the equilibrium of a model
+                that gives way takes many seconds not to be found.
         """
-        here = self.whole.error(rotating)
-        change = self.finer.error(rotating) - self.near.error(rotating)
+        near = self.near.error(strains)
+        if not abs(near) <= enough:
+            return abs(near)
+        here = self.whole.error(strains)
+        if not np.isfinite(here):
+            return float('inf')
+        return self._largest(here, near, self.finer.error(strains))
+
+    @staticmethod
+    def _largest(here: float, near: float, finer: float) -> float:
+        change = finer - near
         largest = max(abs(here), abs(here + change), abs(here + 2 * change))
         return largest if np.isfinite(largest) else float('inf')
 
@@ -118,11 +150,11 @@ def indent(mesh: TetMesh, material: Material, indenter: Indenter, depth: float) 
     Raises:
         MeshError: there is no equilibrium at that depth.
     """
-    around = surroundings(mesh, indenter)
-    meshes = (mesh, around, refined(around))
+    around = surroundings(mesh, indenter, _WIDE * indenter.radius, _NEAR)
+    meshes = (surroundings(mesh, indenter), around, refined(around))
     soft = [
         settlement(ElasticModel(part, material, 'linear_smoothed'), indenter.load(part))[0]
-        for part in meshes
+        for part in (mesh, *meshes[1:])
     ]
     parts = [min(value / soft[0], 1.0) for value in soft]
     whole, near, finer = (
@@ -138,34 +170,17 @@ def _indent(
     free = _free(mesh)
     rest = np.zeros(3 * mesh.node_count)
     solve = preconditioner(ElasticModel(mesh, material, 'linear'), rest, free)
-    tissue = NeoHookean(smoothed_points(mesh, material), free, solve)
+    tissue = Hyperelastic(smoothed_points(mesh, material), free, solve)
     for steps in _STEPS:
         try:
-            force, _ = tissue.press(load.ravel(), deep, steps)
+            force, moved = tissue.press(load.ravel(), deep, steps)
         except MeshError:
             if steps == _STEPS[-1]:
                 raise
         else:
             break
-    return MeshIndentation(mesh, material, load, deep, force, part)
+    return MeshIndentation(mesh, material, load, deep, force, moved.reshape(-1, 3), part)
 
 
 def _free(mesh: TetMesh) -> NDArray[np.bool_]:
     return np.repeat(mesh.fixed == 0, 3)
-
-
-def surroundings(mesh: TetMesh, indenter: Indenter) -> TetMesh:
-    """Return the elements around an indenter, fixed where they touch others.
-
-    Args:
-        mesh: the whole.
-        indenter: at the centre.
-    """
-    middles = mesh.rest[mesh.tetrahedra].mean(axis=1)
-    away = np.linalg.norm(middles - indenter.centre, axis=1)
-    most = np.partition(away, _NEAR - 1)[_NEAR - 1] if len(away) > _NEAR else np.inf
-    kept = away <= min(_WIDE * indenter.radius, max(most, 1.5 * indenter.radius))
-    held = mesh.fixed.copy()
-    held[mesh.tetrahedra[~kept].ravel()] = 1
-    nodes, tetrahedra = np.unique(mesh.tetrahedra[kept].astype(np.int64), return_inverse=True)
-    return TetMesh(mesh.rest[nodes], tetrahedra.reshape(-1, 4), held[nodes])

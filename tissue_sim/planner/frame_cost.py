@@ -1,4 +1,7 @@
-"""Measured CPU time of a method's frames on a scene, and savings by an active region."""
+"""Measured CPU time of a method's frames on a scene, and savings by an active region.
+
+The tool goes as deep as the budget says, and cuts nothing: a law counts where the tissue strains.
+"""
 
 import math
 import time
@@ -6,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact, indenter_contact
 from cutting_trainer.tissue_sim.elasticity.models import ModelName
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
@@ -18,27 +22,66 @@ _SHORT, _LONG = 4, 16
 _FRAMES = 16
 _REPEATS = 3
 """Strokes; the least time of each frame counts, because other load only adds to it."""
+_ENOUGH_S = 0.4
+"""CPU time after which strokes are not repeated."""
+_HOPELESS = 4.0
+"""Cost, in shares of the allowed one, at which implicit steps are not tried elsewhere."""
+_NEVER = 1e9
+"""Force at which the blade enters [N]."""
 _COUPLING = 200.0
 """Stiffness of the coupling spring in the measurement [N/m]."""
 
 
-def frame_cost(task: Task, model: ModelName, integrator: IntegratorName) -> Cost:
+def tool_depth(task: Task, settled: float) -> float:
+    """Return how deep the tool goes until the tissue is as deep as required [m].
+
+    Args:
+        task: the scene.
+        settled: settlement of the tissue by force [m/N].
+    """
+    return task.budget.displacement * (1.0 + 1.0 / (settled * _COUPLING))
+
+
+def frame_cost(
+    task: Task,
+    model: ModelName,
+    integrator: IntegratorName,
+    depth: float,
+    active: ActiveSettings | None = None,
+) -> Cost:
     """Return the CPU time of frames in which a tool goes in and out.
 
     Frames are cut short and extrapolated by their number of substeps, so that very slow methods do
     not delay the planner.
+
+    Args:
+        task: the scene.
+        model, integrator: the method.
+        depth: of the tool [m].
+        active: region; None: all nodes move.
     """
+    active = active or ActiveSettings()
     indenters = places(task.mesh, task.budget.contact_radius)
     if integrator == 'implicit':  # the number of iterations depends on place and depth
-        found = [_Timed(task, model, integrator, indenter, _LONG) for indenter in indenters]
-        for timed in found:
-            timed.stroke(_REPEATS)
+        found: list[_Timed] = []
+        for indenter in indenters:
+            found.append(_Timed(task, model, integrator, indenter, depth, _LONG, active))
+            found[-1].stroke()
+            if found[-1].frame > _HOPELESS * task.available:
+                break
+            found[-1].stroke()
         return Cost(found[0].substeps, found[0].step, max(timed.frame for timed in found), 0.0)
-    long, short = (_Timed(task, model, integrator, indenters[0], most) for most in (_LONG, _SHORT))
+    long, short = (
+        _Timed(task, model, integrator, indenters[0], depth, most, active)
+        for most in (_LONG, _SHORT)
+    )
+    start = time.process_time()
     for _ in range(_REPEATS):  # alternately, so that both see the same load of the machine
         long.stroke()
         if long.substeps > _LONG:
             short.stroke()
+        if time.process_time() - start > _ENOUGH_S:
+            break
     if long.substeps == 1:
         return Cost(1, long.step, long.frame, 0.0)
     if long.substeps <= _LONG:
@@ -71,16 +114,18 @@ class _Timed:
         model: ModelName,
         integrator: IntegratorName,
         indenter: Indenter,
+        depth: float,
         most: int,
+        active: ActiveSettings,
     ) -> None:
         s = task.stepping
         stepping = replace(
             s, integrator=integrator, min_substeps=min(s.min_substeps, most), max_substeps=most
         )
         self._simulation = TissueSimulation(
-            task.mesh, task.material, task.resistance, model=model, stepping=stepping
+            task.mesh, task.material, _uncut(task), model=model, stepping=stepping, active=active
         )
-        self._contacts = _in_and_out(task, indenter)
+        self._contacts = _in_and_out(task, indenter, depth)
         self._times: list[list[float]] = []
         self.substeps, self.step = 0, 0.0
 
@@ -103,9 +148,11 @@ class _Timed:
         return frame_time(integrator, np.min(self._times, axis=0).tolist())
 
 
-def _in_and_out(task: Task, indenter: Indenter) -> list[ToolContact]:
-    # Below the force at which the blade enters.
-    depth = min(0.9 * task.resistance.threshold / _COUPLING, 0.5 * task.budget.displacement)
+def _uncut(task: Task) -> Resistance:
+    return replace(task.resistance, threshold=_NEVER)
+
+
+def _in_and_out(task: Task, indenter: Indenter, depth: float) -> list[ToolContact]:
     shares = [math.sin(math.pi * number / _FRAMES) ** 2 for number in range(_FRAMES)]
     place = indenter.centre, indenter.direction
     return [indenter_contact(task.mesh, *place, share * depth, _COUPLING) for share in shares]
@@ -121,17 +168,19 @@ def _timed(simulation: TissueSimulation, contact: ToolContact | None) -> tuple[F
 class _Strokes:
     """Timed frames in which a tool goes in, out, and stays away, with an active region."""
 
-    def __init__(self, task: Task, candidate: Candidate, active: ActiveSettings) -> None:
+    def __init__(
+        self, task: Task, candidate: Candidate, depth: float, active: ActiveSettings
+    ) -> None:
         self._simulation = TissueSimulation(
             task.mesh,
             task.material,
-            task.resistance,
+            _uncut(task),
             model=candidate.model,
             stepping=task.stepped_by(candidate),
             active=active,
         )
         indenter = places(task.mesh, task.budget.contact_radius, 1)[0]
-        self._contacts = _in_and_out(task, indenter)
+        self._contacts = _in_and_out(task, indenter, depth)
         self._times: list[list[float]] = []
 
     def stroke(self) -> np.ndarray:
@@ -149,10 +198,8 @@ class _Strokes:
         return float(np.median(np.min(self._times, axis=0)))
 
 
-def with_regions(
-    task: Task, candidate: Candidate, regions: list[ActiveSettings]
-) -> list[Candidate]:
-    """Return the method with some active regions, with measured cost and error.
+def with_sleepers(task: Task, candidate: Candidate, depth: float) -> Candidate:
+    """Return the method with an active region in which slow nodes sleep, with cost and error.
 
     The error is the largest difference of any node's displacement while a tool goes in, out, and
     stays away, relative to the largest displacement.
@@ -160,24 +207,20 @@ def with_regions(
     Args:
         task: the scene.
         candidate: the method with all nodes moving.
-        regions: the active regions.
+        depth: of the tool [m].
     """
-    whole, *parts = (_Strokes(task, candidate, r) for r in [ActiveSettings(), *regions])
-    right, *others = [strokes.stroke() for strokes in [whole, *parts]]
-    for _ in range(_REPEATS - 1):  # alternately, so that all see the same load of the machine
-        for strokes in [whole, *parts]:
+    active = ActiveSettings('on')
+    both = [_Strokes(task, candidate, depth, region) for region in (ActiveSettings(), active)]
+    right, seen = (strokes.stroke() for strokes in both)
+    for _ in range(_REPEATS - 1):  # alternately, so that both see the same load of the machine
+        for strokes in both:
             strokes.stroke()
     most = float(np.linalg.norm(right, axis=2).max())
-    found = []
-    for region, part, seen in zip(regions, parts, others, strict=True):
-        wrong = float(np.linalg.norm(seen - right, axis=2).max()) / most
-        share, cost = part.frame / whole.frame, candidate.cost
-        found.append(
-            replace(
-                candidate,
-                active=region,
-                errors=replace(candidate.errors, region=wrong),
-                cost=replace(cost, fixed=share * cost.fixed, each=share * cost.each),
-            )
-        )
-    return found
+    wrong = float(np.linalg.norm(seen - right, axis=2).max()) / most
+    share, cost = both[1].frame / both[0].frame, candidate.cost
+    return replace(
+        candidate,
+        active=active,
+        errors=replace(candidate.errors, region=wrong),
+        cost=replace(cost, fixed=share * cost.fixed, each=share * cost.each),
+    )

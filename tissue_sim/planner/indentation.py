@@ -12,6 +12,8 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 Floats = NDArray[np.float64]
 
+WHOLE = 4000
+"""Elements nearest to a press that are loaded: farther ones are the same for all models."""
 _PLACES = 3
 _A, _B = (6 - np.sqrt(15)) / 21, (6 + np.sqrt(15)) / 21
 _POINTS = np.array(
@@ -104,3 +106,27 @@ def settlement(model: ElasticModel, load: Floats) -> tuple[float, Floats]:
     """
     u = solve_static(model, np.repeat(model.mesh.fixed == 0, 3), load, 1e-6)
     return float(np.sum(load * u)), u
+
+
+def surroundings(
+    mesh: TetMesh, indenter: Indenter, reach: float = np.inf, most: int = WHOLE
+) -> TetMesh:
+    """Return the elements around an indenter, fixed where they touch others; the mesh itself if
+    these are all.
+
+    Args:
+        mesh: the whole.
+        indenter: at the centre.
+        reach: radius of the region [m], at least 1.5 radii of the indenter.
+        most: elements at most, if the indenter needs no more.
+    """
+    middles = mesh.rest[mesh.tetrahedra].mean(axis=1)
+    away = np.linalg.norm(middles - indenter.centre, axis=1)
+    last = np.partition(away, most - 1)[most - 1] if len(away) > most else np.inf
+    kept = away <= min(reach, max(last, 1.5 * indenter.radius))
+    if kept.all():
+        return mesh
+    held = mesh.fixed.copy()
+    held[mesh.tetrahedra[~kept].ravel()] = 1
+    nodes, tetrahedra = np.unique(mesh.tetrahedra[kept].astype(np.int64), return_inverse=True)
+    return TetMesh(mesh.rest[nodes], tetrahedra.reshape(-1, 4), held[nodes])

@@ -12,10 +12,16 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.refine import refined
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.planner.indentation import Indenter, places, settlement
+from cutting_trainer.tissue_sim.planner.contact_errors import contact_error
+from cutting_trainer.tissue_sim.planner.indentation import (
+    Indenter,
+    places,
+    settlement,
+    surroundings,
+)
 
 if TYPE_CHECKING:
-    from cutting_trainer.tissue_sim.planner.deep_indentation import DeepIndentation
+    from cutting_trainer.tissue_sim.planner.deep_indentation import DeepIndentation, StrainName
 
 Floats = NDArray[np.float64]
 
@@ -37,23 +43,29 @@ class Strains:
     indenter: Indenter
     depth: float
 
-    @cached_property
-    def linear(self) -> float:
-        """Error of models without rotations [-]; infinite if the tissue collapses before."""
-        return self._error(rotating=False)
+    def error(self, model: ModelName, enough: float = np.inf) -> float:
+        """Return the error of a model [-]; infinite if it or the tissue collapses.
 
-    @cached_property
-    def rotating(self) -> float:
-        """Error of models with rotations [-]; infinite if they or the tissue collapse."""
-        return self._error(rotating=True)
+        Args:
+            model: which one.
+            enough: see `DeepIndentation.error`.
+        """
+        strains: StrainName = 'law' if model == 'stiffening' else 'linear'
+        if model.startswith('corotational'):
+            strains = 'rotating'
+        if strains not in self._found:
+            deep = self._deep_indentation
+            self._found[strains] = deep.error(strains, enough) if deep else float('inf')
+        return self._found[strains]
 
     @property
     def steepness(self) -> float:
         """Depth of the indentation over its radius [-]; infinite if the tissue collapses before."""
         return self._deep_indentation.steepness if self._deep_indentation else float('inf')
 
-    def _error(self, *, rotating: bool) -> float:
-        return self._deep_indentation.error(rotating) if self._deep_indentation else float('inf')
+    @cached_property
+    def _found(self) -> dict['StrainName', float]:
+        return {}
 
     @cached_property
     def _deep_indentation(self) -> 'DeepIndentation | None':
@@ -74,12 +86,16 @@ class Probing:
     Attributes:
         elements: largest relative error of the settlement by element size, for plain and for
             smoothed elements [-].
+        contact: largest relative error of a tool's depth by its footprint [-].
         strains: errors at the required depth.
+        settled: settlement at the softest place, by force [m/N].
         frequency: upper bound of the slowest motion excited by a load [rad/s].
     """
 
     elements: dict[bool, float]
+    contact: float
     strains: Strains
+    settled: float
     frequency: float
 
 
@@ -92,29 +108,36 @@ def probe(mesh: TetMesh, material: Material, radius: float, displacement: float)
         radius: of the area that a tool loads [m].
         displacement: required depth [m].
     """
-    fine = refined(mesh)
     names: dict[bool, ModelName] = {False: 'linear', True: 'linear_smoothed'}
-    here = {smoothed: ElasticModel(mesh, material, name) for smoothed, name in names.items()}
-    there = {smoothed: ElasticModel(fine, material, name) for smoothed, name in names.items()}
+    whole = ElasticModel(mesh, material, 'linear_smoothed')
     errors: dict[bool, list[float]] = {False: [], True: []}
     indenters = places(mesh, radius)
-    softest, most, slowest = indenters[0], 0.0, np.inf
+    softest, most, slowest, contact = indenters[0], 0.0, np.inf, 0.0
+    near, fine = mesh, mesh
     for indenter in indenters:
-        load, finer = indenter.load(mesh), indenter.load(fine)
-        coarse = {smoothed: settlement(model, load) for smoothed, model in here.items()}
+        if fine is mesh or near is not mesh:  # a small mesh is refined once
+            near = surroundings(mesh, indenter)
+            fine = refined(near)
+            here = {s: ElasticModel(near, material, name) for s, name in names.items()}
+            there = {s: ElasticModel(fine, material, name) for s, name in names.items()}
+        load, finer = indenter.load(near), indenter.load(fine)
+        coarse = {smoothed: settlement(model, load)[0] for smoothed, model in here.items()}
         half = {smoothed: settlement(model, finer)[0] for smoothed, model in there.items()}
         # Both converge to one value: plain elements from below, smoothed ones much closer.
-        limits = [half[s] + (half[s] - coarse[s][0]) / 3 for s in names]
+        limits = [half[s] + (half[s] - coarse[s]) / 3 for s in names]
         for smoothed in names:
-            value = coarse[smoothed][0]
+            value = coarse[smoothed]
             errors[smoothed].append(max(abs(value / limit - 1) for limit in limits))
-        value, u = coarse[True]
+        value, u = settlement(whole, indenter.load(mesh))
         if value > most:
             softest, most = indenter, value
-        inertia = float(here[True].mass @ np.square(u).sum(axis=1))
+        inertia = float(whole.mass @ np.square(u).sum(axis=1))
         slowest = min(slowest, float(np.sqrt(value / inertia)))
+        contact = max(contact, contact_error(mesh, material, indenter, displacement))
     return Probing(
         {smoothed: max(found) for smoothed, found in errors.items()},
+        contact,
         Strains(mesh, material, softest, displacement),
+        most,
         slowest,
     )

@@ -24,17 +24,15 @@ def model_errors(model: ModelName, probing: Probing, budget: Budget) -> ErrorEst
     A linear model has a strain of cos(theta) - 1 in an undeformed element that rotates by theta.
     """
     at_rest = errors_at_rest(model, probing, budget)
-    strains = probing.strains
-    rotating = model.startswith('corotational')
-    return replace(at_rest, strain=MARGIN * (strains.rotating if rotating else strains.linear))
+    enough = (budget.error - at_rest.total) / MARGIN
+    return replace(at_rest, strain=MARGIN * probing.strains.error(model, enough))
 
 
 def errors_at_rest(model: ModelName, probing: Probing, budget: Budget) -> ErrorEstimate:
     """Return the errors known before any deep indentation; strain is 0."""
-    elements = MARGIN * probing.elements[model.endswith('_smoothed')]
-    if model.startswith('corotational'):
-        return ErrorEstimate(elements, 0.0, 0.0)
-    return ErrorEstimate(elements, 1 - math.cos(math.radians(budget.rotation)), 0.0)
+    elements = MARGIN * probing.elements[model not in ('linear', 'corotational')]
+    turned = 1 - math.cos(math.radians(budget.rotation)) if model.startswith('linear') else 0.0
+    return ErrorEstimate(elements, turned, 0.0, contact=MARGIN * probing.contact)
 
 
 def time_error(

@@ -43,9 +43,10 @@ class PlanMonitor:
         said = [f'not {rejection}' for rejection in self._plan.rejected]
         chosen = self._plan.chosen
         if chosen is not None:
+            causes = ', '.join(f'{percent(v)} {cause}' for cause, v in chosen.errors.causes.items())
             said.append(
-                f'method: {chosen.name}; error {percent(chosen.errors.total)}, '
-                f'{ms(chosen.cost.frame)} a frame of {ms(self._plan.task.available)}'
+                f'method: {chosen.name}; error {percent(chosen.errors.total)} ({causes}), '
+                f'{ms(chosen.cost.frame)} a frame of {ms(self._plan.available)}'
             )
         return said
 
@@ -67,5 +68,5 @@ class PlanMonitor:
             'method': chosen.name,
             'predicted_error': chosen.errors.total,
             'predicted_frame': chosen.cost.frame,
-            'allowed_frame': self._plan.task.available,
+            'allowed_frame': self._plan.available,
         }

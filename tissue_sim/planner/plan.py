@@ -5,13 +5,17 @@ method on this machine.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-from cutting_trainer.tissue_sim.elasticity.models import PLANNED_MODELS, ModelName
-from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
 from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost, ErrorEstimate, Task
-from cutting_trainer.tissue_sim.planner.frame_cost import frame_cost, with_regions
+from cutting_trainer.tissue_sim.planner.far_field_choice import far_field
+from cutting_trainer.tissue_sim.planner.frame_cost import (
+    frame_cost,
+    tool_depth,
+    with_sleepers,
+)
 from cutting_trainer.tissue_sim.planner.mesh_errors import Probing, probe
 from cutting_trainer.tissue_sim.planner.method_errors import (
     errors_at_rest,
@@ -36,10 +40,6 @@ _PREFERENCE: tuple[IntegratorName, ...] = ('symplectic_euler', 'rk4', 'implicit'
 _CHECKED = 0.4
 """Ratio of indentation depth to radius up to which predictions were checked against quadratic
 elements."""
-_FEWEST = 30
-"""Smallest number of nodes in an active region."""
-_HOPELESS = 0.25
-"""Frame time above which fewer nodes are not tried [s]: the trial would take too long."""
 
 
 @dataclass(frozen=True)
@@ -47,37 +47,24 @@ class Plan:
     """Result of the planner.
 
     Attributes:
-        chosen: the simplest method that fits, or None.
+        chosen: the simplest that fits, or None.
         rejected: every other method with the reason.
         remedies: changes of the scene that would help, if no method fits.
-        task: the task.
         tetrahedra: of the mesh.
-        probing: results of the trial loads.
+        available: CPU time allowed for a frame [s].
+        worst: cost after cuts have shortened the step as far as the scene allows.
+        caution: a sentence if the indentation is deeper than the checked range of the predictions.
+        own: why the scene's own model fails the budget, if it does and is not among the rejected.
     """
 
     chosen: Candidate | None
     rejected: tuple[Rejection, ...]
     remedies: tuple[str, ...]
-    task: Task = field(repr=False)
     tetrahedra: int
-    probing: Probing = field(repr=False)
-
-    @property
-    def worst(self) -> Cost | None:
-        """Cost after cuts have shortened the step as far as the scene allows."""
-        return self.task.worst(self.chosen) if self.chosen else None
-
-    @property
-    def caution(self) -> str:
-        """A sentence if the indentation is deeper than the checked range of the predictions."""
-        if self.chosen is None or self.probing.strains.steepness <= _CHECKED:
-            return ''
-        return (
-            f'the indentation is {self.probing.strains.steepness:.2f} of its radius deep, and '
-            f'errors are checked up to {_CHECKED:g}: deeper, the tissue may yield by far more than '
-            'predicted; '
-            'a broader contact_radius or less displacement makes it shallower'
-        )
+    available: float
+    worst: Cost | None = None
+    caution: str = ''
+    own: str = ''
 
     def over(self, substeps: float, tetrahedra: int) -> str:
         """Return a sentence if the cut tissue exceeds the allowed cost, else ''.
@@ -91,11 +78,11 @@ class Plan:
         cost = self.chosen.cost
         share = tetrahedra / self.tetrahedra
         frame = cost.fixed + substeps * cost.each * share
-        if frame <= self.task.available:
+        if frame <= self.available:
             return ''
         return (
             f'after the cut {self.chosen.name} needs {substeps:.0f} substeps and '
-            f'{ms(frame)} a frame, of {ms(self.task.available)} that it may use'
+            f'{ms(frame)} a frame, of {ms(self.available)} that it may use'
         )
 
 
@@ -109,13 +96,13 @@ def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
     Raises:
         MeshError: the mesh cannot be probed.
     """
-    b = task.budget
-    count = len(task.mesh.tetrahedra)
-    say('errors by elements, by trial loads')
+    b, count = task.budget, len(task.mesh.tetrahedra)
+    say('errors by elements and footprint, by trial loads')
     probing = probe(task.mesh, task.material, b.contact_radius, b.displacement)
+    depth = tool_depth(task, probing.settled)
     rejected: list[Rejection] = []
     tried: list[Candidate] = []
-    for model in PLANNED_MODELS:
+    for model in MODELS:
         errors = errors_at_rest(model, probing, b)
         if errors.total <= b.error:  # deep indentation takes seconds to compute
             say(f'error of {model} by large deformation')
@@ -123,17 +110,47 @@ def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
         if errors.total > b.error:
             rejected.append(inaccurate(model, errors, b))
             continue
-        found = sorted(_candidates(task, model, errors, probing, say), key=lambda c: c.cost.frame)
+        candidates = _candidates(task, model, errors, probing, depth, say)
+        found = sorted(candidates, key=lambda c: c.cost.frame)
         rejected += [unfit(task, c) for c in found if not task.fits(c)]
         tried += found
         fitting = [c for c in found if task.fits(c)]
-        best = _lighter(task, _preferred(task, fitting), rejected) if fitting else None
-        best = best or _near_the_tool(task, found, rejected)
+        best = _lighter(task, _preferred(task, fitting), depth, rejected) if fitting else None
+        best = best or _near_the_tool(task, found, probing, depth, rejected, say)
         if best is not None:
             rejected += [dearer(c, best) for c in fitting if c.name != best.name]
-            return Plan(best, tuple(rejected), (), task, count, probing)
+            own = _own(task, best, probing, rejected, say)
+            caution, worst = _caution(probing), task.worst(best)
+            return Plan(best, tuple(rejected), (), count, task.available, worst, caution, own)
     said = remedies(task, probing, tried)
-    return Plan(None, tuple(rejected), said, task, count, probing)
+    return Plan(None, tuple(rejected), said, count, task.available)
+
+
+def _own(
+    task: Task,
+    best: Candidate,
+    probing: Probing,
+    rejected: list[Rejection],
+    say: Callable[[str], None],
+) -> str:
+    """Return why the scene's own model, not tried, fails the budget; else an empty string."""
+    if task.model == best.model or any(r.method == task.model for r in rejected):
+        return ''
+    say(f'error of {task.model}, which the scene has')
+    errors = model_errors(task.model, probing, task.budget)
+    fails = errors.total > task.budget.error
+    return inaccurate(task.model, errors, task.budget).why if fails else ''
+
+
+def _caution(probing: Probing) -> str:
+    steepness = probing.strains.steepness
+    if steepness <= _CHECKED:
+        return ''
+    return (
+        f'the indentation is {steepness:.2f} of its radius deep, and errors are checked up to '
+        f'{_CHECKED:g}: deeper, the tissue may yield by far more than predicted; '
+        'a broader contact_radius or less displacement makes it shallower'
+    )
 
 
 def _candidates(
@@ -141,13 +158,14 @@ def _candidates(
     model: ModelName,
     errors: ErrorEstimate,
     probing: Probing,
+    depth: float,
     say: Callable[[str], None],
 ) -> Iterator[Candidate]:
     for integrator in INTEGRATORS:
         if integrator == 'euler' and task.material.alpha == task.material.beta == 0.0:
             continue
         say(f'cost of {model} by {integrator}')
-        cost = frame_cost(task, model, integrator)
+        cost = frame_cost(task, model, integrator, depth)
         wrong = time_error(integrator, task.material, probing.frequency, cost.step)
         yield Candidate(model, integrator, replace(errors, time=wrong), cost)
 
@@ -162,11 +180,11 @@ def _preferred(task: Task, fitting: list[Candidate]) -> Candidate:
     return min(alike, key=lambda c: _PREFERENCE.index(c.integrator))
 
 
-def _lighter(task: Task, best: Candidate, rejected: list[Rejection]) -> Candidate:
-    """Return the method, with an active region if that is clearly cheaper."""
+def _lighter(task: Task, best: Candidate, depth: float, rejected: list[Rejection]) -> Candidate:
+    """Return the method, with sleeping nodes if that is clearly cheaper."""
     if best.cost.frame <= _CHEAP * task.available:
         return best
-    (part,) = with_regions(task, best, [ActiveSettings('on')])
+    part = with_sleepers(task, best, depth)
     if task.fits(part) and _ALIKE * part.cost.frame < best.cost.frame:
         return part
     rejected.append(dearer(part, best) if task.fits(part) else unfit(task, part))
@@ -174,20 +192,18 @@ def _lighter(task: Task, best: Candidate, rejected: list[Rejection]) -> Candidat
 
 
 def _near_the_tool(
-    task: Task, found: list[Candidate], rejected: list[Rejection]
+    task: Task,
+    found: list[Candidate],
+    probing: Probing,
+    depth: float,
+    rejected: list[Rejection],
+    say: Callable[[str], None],
 ) -> Candidate | None:
-    """Return the cheapest of the too expensive methods, with as many nodes that move on their own
-    as the cost allows.
-    """
+    """Return the cheapest of the too expensive methods with a far field, if that is in time."""
     dear = [c for c in found if c.errors.total <= task.budget.error and not task.in_time(c)]
     cheapest = min(dear, key=lambda c: task.worst(c).frame, default=None)
-    if cheapest is None or cheapest.cost.frame > _HOPELESS:
+    if cheapest is None or task.worst(cheapest).substeps > task.stepping.max_substeps:
         return None
-    share = task.available / task.worst(cheapest).frame
-    nodes = [int(part * share * task.mesh.node_count) for part in (0.8, 0.5)]
-    regions = [ActiveSettings('budget', n) for n in nodes if n >= _FEWEST]
-    if task.worst(cheapest).substeps > task.stepping.max_substeps or not regions:
-        return None
-    parts = with_regions(task, cheapest, regions)
-    rejected += [unfit(task, part) for part in parts if not task.fits(part)]
-    return next((part for part in parts if task.fits(part)), None)
+    part, others = far_field(task, cheapest, probing.strains.indenter, depth, say)
+    rejected += others
+    return part

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from cutting_trainer.tissue_sim.elasticity.models import PLANNED_MODELS, ModelName
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
 from cutting_trainer.tissue_sim.planner.budget import Budget
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, ErrorEstimate, Task
 from cutting_trainer.tissue_sim.planner.mesh_errors import Probing
@@ -33,6 +33,7 @@ def inaccurate(model: ModelName, errors: ErrorEstimate, budget: Budget) -> Rejec
         f'at the {budget.rotation:g} degrees that this scene allows': errors.rotation,
         f'at the {1e3 * budget.displacement:g} mm that this scene allows': errors.strain,
         'by elements of this size': errors.elements,
+        'by the footprint of the tool': errors.contact,
     }
     said = [
         f'{percent(value)} {cause}' if math.isfinite(value) else f'gives way {cause}'
@@ -51,7 +52,10 @@ def unfit(task: Task, candidate: Candidate) -> Rejection:
         by_region = (
             f', {percent(errors.region)} by far nodes that move together' if errors.region else ''
         )
-        return Rejection(candidate.name, f'{percent(errors.total)}, {by_step}{by_region}')
+        return Rejection(
+            candidate.name,
+            f'{percent(errors.total)}, {by_step}{by_region}; {ms(cost.frame)} a frame',
+        )
     if cost.frame > task.available:
         return Rejection(
             candidate.name,
@@ -83,7 +87,7 @@ def remedies(task: Task, probing: Probing, tried: list[Candidate]) -> tuple[str,
 
 
 def _for_accuracy(b: Budget, probing: Probing) -> list[str]:
-    found = {model: model_errors(model, probing, b) for model in PLANNED_MODELS}
+    found = {model: model_errors(model, probing, b) for model in MODELS}
     best = min(found, key=lambda model: found[model].total)
     errors = found[best]
     if errors.total <= b.error:
@@ -95,7 +99,7 @@ def _for_accuracy(b: Budget, probing: Probing) -> list[str]:
         # Errors of displacement fall with the square of the size of the elements.
         finer = math.sqrt(errors.elements / (0.5 * b.error))
         said.append(f'a mesh with edges {finer:.1f} times shorter: {best}')
-    left = b.error - errors.elements
+    left = b.error - errors.elements - errors.contact
     if errors.strain > left > 0 and math.isfinite(errors.strain):
         less = 1e3 * b.displacement * left / errors.strain
         said.append(f'at most {less:.2g} mm of displacement: {best}')
