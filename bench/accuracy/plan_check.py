@@ -125,10 +125,9 @@ def measured_frame(task: Task, chosen: Candidate) -> float:
         active=chosen.active,
     )
     presses = places(task.mesh, task.budget.contact_radius, 4)[1:]
-    settled = settlement(
-        ElasticModel(task.mesh, task.material, 'linear_smoothed'), presses[0].load(task.mesh)
-    )[0]
-    depths = tool_depth(task, settled) * np.sin(np.linspace(0.0, np.pi, _FRAMES // 2)) ** 2
+    model = ElasticModel(task.mesh, task.material, 'linear_smoothed')
+    softest = max(settlement(model, press.load(task.mesh))[0] for press in presses)
+    depths = tool_depth(task, softest) * np.sin(np.linspace(0.0, np.pi, _FRAMES // 2)) ** 2
     contacts = [
         indenter_contact(task.mesh, press.centre, press.direction, depth)
         for press in presses

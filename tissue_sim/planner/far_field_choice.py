@@ -14,7 +14,7 @@ from cutting_trainer.tissue_sim.planner.rejection_reasons import Rejection, unfi
 
 _FEWEST = 100
 """Number of nodes that is tried first."""
-_MOST = 0.5
+_MAX_SHARE = 0.5
 """Share of all nodes above which a far field saves nothing."""
 _TRIALS = 6
 _AIM = 0.8
@@ -46,7 +46,7 @@ def far_field(
     rejected: list[Rejection] = []
     curve: list[tuple[int, float]] = []
     nodes = _FEWEST
-    while len(curve) < _TRIALS and nodes <= _MOST * task.mesh.node_count:
+    while len(curve) < _TRIALS and nodes <= _MAX_SHARE * task.mesh.node_count:
         say(f'far field with {nodes} nodes')
         error = trial.error(nodes)
         curve.append((nodes, error))
