@@ -10,10 +10,13 @@ import pytest
 from bench.accuracy import chart
 from bench.accuracy import integrator_limits as stability_report
 from bench.accuracy.chart import THESIS, cost_for, sentence, write_chart
+from bench.accuracy.contact_problems import FootprintPress, Sliding
 from bench.accuracy.front import read_points, reasons_off_front, scenes, standing
 from bench.accuracy.integrator_limits import highest_mode, measured_limit
 from bench.accuracy.measure import Point, cpu_per_second, with_front
-from bench.accuracy.problems import AfterCut, Cantilever, static_problems
+from bench.accuracy.panels import static_problems
+from bench.accuracy.peer_points import peer_points
+from bench.accuracy.problems import AfterCut, Cantilever
 from bench.accuracy.reference import HexGrid, Solid, exact_beam, extrapolated, graded
 from bench.accuracy.region import LocalPalpation, describe
 from bench.accuracy.reproduction import block_100, block_258, efficiency, orders
@@ -21,7 +24,7 @@ from bench.accuracy.vibration import Vibration
 from bench.common.meshes import end_load, kuhn_block
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 
 pytestmark = pytest.mark.long
@@ -160,6 +163,23 @@ def test_page_table_and_a_picture_by_panel_are_written(tmp_path: Path) -> None:
         rows = list(csv.DictReader(table))
     assert len(rows) == len(points)
     assert {(row['model'], row['integrator']) for row in rows} >= {THESIS}
+
+
+def test_peers_that_came_to_rest_are_on_the_cantilevers_eight_curves_at_most() -> None:
+    for name in ('cantilever_0.3', 'cantilever_0.47'):
+        peers = peer_points(name)
+        assert {text.split()[0] for text in peers} == {'mujoco-core', 'newton'}
+        assert len(MODELS) + 1 + len(peers) <= 8
+        for line in peers.values():
+            assert [p.tetrahedra for p in line] == sorted(p.tetrahedra for p in line)
+            assert all(0 < p.displacement_error < 1 and p.cpu_per_second > 0 for p in line)
+    assert not peer_points('indentation')
+
+
+def test_a_sphere_on_scattered_nodes_is_the_quadratic_one_and_slides_without_ripple() -> None:
+    press = FootprintPress().rest('linear_smoothed', 4).errors
+    assert press.force < 0.05 and press.displacement < press.force
+    assert Sliding().rest('linear_smoothed', 4).errors.force < 0.10
 
 
 def test_the_chart_prints_the_points_for_machines_too(

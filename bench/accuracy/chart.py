@@ -12,8 +12,10 @@ from rich.console import Console
 
 from bench.accuracy.front import front_table
 from bench.accuracy.measure import Point, measure, reference_cost
+from bench.accuracy.panels import Problem, static_problems
+from bench.accuracy.peer_points import peer_points
 from bench.accuracy.picture import draw, draw_regions
-from bench.accuracy.problems import ALPHA, BETA, Problem, static_problems
+from bench.accuracy.problems import ALPHA, BETA
 from bench.accuracy.region import ALPHA as REGION_ALPHA
 from bench.accuracy.region import BETA as REGION_BETA
 from bench.accuracy.region import LocalPalpation, describe
@@ -39,8 +41,9 @@ _PAGE = """# Speed against accuracy
 Written by `./trainer chart`: every elastic model with every integrator, on problems whose solution
 is known by other means. To the right is slower, upwards is worse; the grey line joins the points
 that no other beats in both. A curve is a model with the integrator that is cheapest on its finest
-mesh, dashed the error of its force; the other integrators are faint. Below each picture stands the
-cost of an error of 10 % and of 1 %.
+mesh, dashed the error of its force; the other integrators are faint. Other packages bend the same
+beam in a [run of their own](performance.md#beside-others). Below each picture stands the cost of an
+error of 10 % and of 1 %.
 All digits, both errors and the step: [points.csv](charts/points.csv).
 
 - **CPU time** is that of one thread for one second of simulated time at {safety:g} of the stable
@@ -111,8 +114,10 @@ def write_chart(folder: Path, points: list[Point], yardsticks: tuple[float, floa
     panels = []
     for problem in (*static_problems(), Vibration()):
         own = [point for point in points if point.problem == problem.name]
-        text = sentence(own)
-        figure = draw(problem.title, problem.reference_name, own, text, THESIS, DEFAULT)
+        if not own:
+            continue
+        text, peers = sentence(own), peer_points(problem.name)
+        figure = draw(problem.title, problem.reference_name, own, text, THESIS, DEFAULT, peers)
         figure.savefig(charts / f'{problem.name}.png', dpi=110)
         panels.append(_panel(problem))
     panels.append(_region_panel(charts, [p for p in points if p.problem == LocalPalpation.name]))

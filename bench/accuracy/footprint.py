@@ -43,8 +43,12 @@ class Press:
 
     Args:
         mesh: of `block`.
-        model: elastic model.
         contact: how the load is spread.
+        model: name of the elastic model.
+        material: of the block.
+
+    Attributes:
+        model: the elastic model.
     """
 
     def __init__(
@@ -52,10 +56,11 @@ class Press:
         mesh: TetMesh,
         contact: ContactName = 'footprint',
         model: ModelName = 'linear_smoothed',
+        material: Material = MATERIAL,
     ) -> None:
         self._mesh = mesh
-        self._model = ElasticModel(mesh, MATERIAL, model)
-        self._springs = ToolSprings(mesh, MATERIAL.plane_modulus, contact)
+        self.model = ElasticModel(mesh, material, model)
+        self._springs = ToolSprings(mesh, material.plane_modulus, contact)
         self._free = np.repeat(mesh.fixed == 0, 3)
         corners = mesh.rest[mesh.triangles]
         self._top = np.flatnonzero((corners[:, :, 2] > BLOCK[2] - PLANE_TOLERANCE_M).all(axis=1))
@@ -116,7 +121,7 @@ class Press:
     def _compliance(self, spring: Coupling) -> float:
         load = np.zeros_like(self._mesh.rest)
         load[spring.nodes] = spring.weights[:, None] * _UP
-        moved = solve_static(self._model, self._free, load, 1e-4)
+        moved = solve_static(self.model, self._free, load, 1e-4)
         return float(spring.weights @ moved[spring.nodes, 2])
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.accuracy.problems import AfterCut, Problem, Rest, static_problems
+from bench.accuracy.panels import Problem, static_problems
+from bench.accuracy.problems import AfterCut, Rest
 from bench.accuracy.region import LocalPalpation, describe
 from bench.accuracy.vibration import Vibration
 from bench.common.meshes import kuhn_block
@@ -74,7 +75,7 @@ def measure(
 def _static(problem: Problem, progress: Callable[[str], None], coarse: bool) -> list[Point]:
     points = []
     for resolution in problem.resolutions[: 1 if coarse else None]:
-        for model in MODELS:
+        for model in getattr(problem, 'models', MODELS):
             progress(f'{problem.title}, {model}, resolution {resolution}')
             rest = problem.rest(model, resolution)
             for integrator in INTEGRATORS:

@@ -2,6 +2,7 @@
 
 import math
 import textwrap
+from collections.abc import Mapping
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -16,6 +17,7 @@ _COLOURS = {
     'corotational_smoothed': '#882255',
     'stiffening': '#228833',
 }
+_PEERS = '#777777', '#aa8866'
 _LINE = 11.0
 """Distance of names from each other [pt]."""
 _REGIONS = {'off': 'o', 'on': '^', 'budget': 's'}
@@ -30,6 +32,7 @@ def draw(
     sentence: str,
     thesis: tuple[str, str],
     default: tuple[str, str],
+    peers: Mapping[str, list[Point]] | None = None,
 ) -> Figure:
     """Return errors against CPU time, both logarithmic: a curve for each model, and the thesis's.
 
@@ -39,6 +42,7 @@ def draw(
         points: of the problem.
         sentence: caption.
         thesis, default: model and integrator; the first has a curve of its own, the second rings.
+        peers: curves of other packages, by name: two at most.
     """
     figure, axes = _panel(title, reference, sentence)
     _join(axes, points)
@@ -55,6 +59,8 @@ def draw(
             curves.append((f'{model}, {chosen[0].integrator}', colour, chosen))
     line = [p for p in points if (p.model, p.integrator) == thesis]
     curves.append((f'thesis: {thesis[0]}, {thesis[1]}', 'black', line))
+    others = zip((peers or {}).items(), _PEERS, strict=False)
+    curves += [(name, colour, own) for (name, own), colour in others]
     for _, colour, own in curves:
         _both_errors(axes, own, colour)
     _mark(axes, points, default, '#ddaa33', 330)

@@ -355,15 +355,25 @@ class AfterCut:
 
 
 class LargeStrain:
-    """A cube of human liver between clamps, pressed by 30 %; nodes are scattered, not in rows."""
+    """A block of human liver, strained as in a case of `law_problems`; nodes are scattered.
 
-    name = 'large_strain'
-    title = 'Large strain: a cube that stiffens, pressed by 30 %'
+    Args:
+        case: name of the case.
+    """
+
     reference_name = 'scikit-fem, quadratic hexahedra with the law that stiffens'
-    resolutions = (4, 6, 8)
-    solid = Solid((SIDE, SIDE, SIDE), 5400.0, 0.47)
-    _case = CASES['press 30 %']
+    _titles = {  # noqa: RUF012
+        'punch 10 %': 'Punch of 10 %: a block that stiffens, scattered nodes',
+        'press 30 %': 'Large strain: a cube that stiffens, pressed by 30 %',
+    }
     _seed = 1
+
+    def __init__(self, case: str) -> None:
+        self._case = CASES[case]
+        self.name = 'punch_10' if self._case.punched else 'large_strain'
+        self.title = self._titles[case]
+        self.resolutions = (4, 8, 12) if self._case.punched else (4, 6, 8)
+        self.solid = Solid(self._case.size, 5400.0, 0.47)
 
     @property
     def _stiffening(self) -> float:
@@ -371,11 +381,12 @@ class LargeStrain:
 
     @cached_property
     def reference(self) -> LawBlock:
-        """The pressed cube."""
-        return solved_reference(self._case, self.solid.poissons_ratio, self._stiffening)
+        """The strained block."""
+        nu, cells = self.solid.poissons_ratio, self._case.cells
+        return solved_reference(self._case, nu, self._stiffening, cells)
 
     def rest(self, model: ModelName, resolution: int) -> Rest:
-        """Return the cube, with so many edges over its height, at rest between the clamps."""
+        """Return the block, with so many edges over its side, at rest between the clamps."""
         mesh = unstructured_block(self._case, SIDE / resolution, self._seed)
         stiff = replace(material(self.solid), stiffening=self._stiffening)
         elastic = ElasticModel(mesh, stiff, model)
@@ -386,19 +397,3 @@ class LargeStrain:
             u = followed(self._case, elastic)
         found = errors_at(self._case, self.reference, elastic, u)
         return Rest(elastic, u, Errors(found.field, abs(found.force)))
-
-
-Problem = Indentation | Cantilever | LargeRotation | AfterCut | LargeStrain
-
-
-def static_problems() -> tuple[Problem, ...]:
-    """Return the problems of the panels, except free vibration."""
-    return (
-        Indentation(),
-        Cantilever(0.3),
-        Cantilever(0.47),
-        Cantilever(0.49),
-        LargeRotation(),
-        AfterCut(),
-        LargeStrain(),
-    )
