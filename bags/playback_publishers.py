@@ -17,11 +17,25 @@ from cutting_trainer.bags.playback_control import Playhead
 from cutting_trainer.bags.playback_messages import RecordedHand, RecordedStream
 from cutting_trainer.bags.qos_adaptation import publisher_qos
 from cutting_trainer.bags.reader import Bag
-from cutting_trainer.bags.topic_names import BUTTON, FORCES, OF_DEVICE, OF_TISSUE, POSE, REPLAYED
-from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, WrenchStampedCodec
+from cutting_trainer.bags.topic_names import (
+    BUTTON,
+    CONTACT,
+    FORCE,
+    FORCES,
+    OF_DEVICE,
+    OF_TISSUE,
+    POSE,
+    REPLAYED,
+)
+from cutting_trainer.node_common.cdr_codec import (
+    ContactCodec,
+    ForceSampleCodec,
+    PoseStampedCodec,
+    WrenchStampedCodec,
+)
 from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
 from cutting_trainer.node_common.qos import EVENTS, LATCHED, NEWEST_BEST_EFFORT, STREAM
-from cutting_trainer.node_common.ros import polled
+from cutting_trainer.node_common.ros import FRAME, polled
 from cutting_trainer.node_common.timing import PeriodicLoop
 
 _RATE_HZ = 1000.0
@@ -150,6 +164,8 @@ class SessionPlayer(Player):
         wanted = (*OF_TISSUE, *FORCES) if drive_device else (*OF_TISSUE, *OF_DEVICE, BUTTON)
         self.topics = [topic for topic in wanted if topic in bag.topics()]
         self._wrench = WrenchStampedCodec('arm_base')
+        # Their fields that an older bag lacks are added.
+        self._grown = {CONTACT: ContactCodec(FRAME), FORCE: ForceSampleCodec(FRAME)}
         self._stream = RecordedStream(bag, self.topics, start)
         self._rounds = 0
 
@@ -175,6 +191,9 @@ class SessionPlayer(Player):
             if message.topic in FORCES:
                 values = self._wrench.decode(data).values
                 data = self._wrench.encode(time.time_ns(), values)
+            elif codec := self._grown.get(message.topic):
+                sample = codec.decode(data)
+                data = codec.encode(sample.stamp_ns, sample.values)
             self._publishers_by_topic[message.topic].publish(data)
 
     def finish(self) -> None:

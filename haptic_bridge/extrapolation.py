@@ -23,6 +23,7 @@ MAX_EXTRAPOLATION = 3.0
 """Length of an extrapolation in sample intervals: one to compute, one to wait, one lost."""
 MIN_SAMPLE_DISTANCE_M = 5e-5
 """[m] Samples closer than this differ by encoder noise only: the force is held instead."""
+_NONE = np.zeros(3)
 _MAX_STIFFNESS_RATIO = 2.0
 """Factor by which the stiffness may change since the newest sample."""
 
@@ -32,7 +33,10 @@ HISTORY = record_type(
         ('time', 'i8', (2,)),  # [ns]
         ('position', 'f8', (2, 3)),  # [m]
         ('force', 'f8', (2, 3)),  # [N]
+        ('torque', 'f8', (2, 3)),  # [N m] about the end of the blade at its tip
         ('stiffness', 'f8', (3, 3)),  # [N/m] of the newest, -d(force)/d(position)
+        ('arms', 'f8', (2, 3)),  # [m] from the tool's tip to root and tip of the blade, then
+        ('immersed', 'f8', (2,)),  # mean and mean square of the places along the blade in tissue
         ('depth', 'f8', (3,)),  # [m] from tip to proxy in the contact that the newest answers
         ('topology', 'i8'),
         ('state', 'i8'),
@@ -42,8 +46,8 @@ HISTORY = record_type(
 
 @inner
 def constant(force: np.ndarray, out: np.ndarray) -> None:
-    """Hold the newest force: F = F_i (eq. 6.3). Forces [N], shape (3,)."""
-    for k in range(3):
+    """Hold the newest force: F = F_i (eq. 6.3). Forces [N], shape (n,)."""
+    for k in range(len(out)):
         out[k] = force[k]
 
 
@@ -54,14 +58,14 @@ def time_linear(time: int, times: np.ndarray, forces: np.ndarray, out: np.ndarra
     Args:
         time: t [ns].
         times: t_{i-1}, t_i [ns], shape (2,).
-        forces: F_{i-1}, F_i [N], shape (2, 3).
-        out: F [N], shape (3,).
+        forces: F_{i-1}, F_i [N], shape (2, n).
+        out: F [N], shape (n,).
     """
     interval = times[1] - times[0]
     s = 0.0
     if interval > 0:
         s = min(max((time - times[1]) / interval, 0.0), MAX_EXTRAPOLATION)
-    for k in range(3):
+    for k in range(len(out)):
         out[k] = forces[1, k] + s * (forces[1, k] - forces[0, k])
 
 
@@ -72,7 +76,7 @@ def position_linear(
     forces: np.ndarray,
     max_stiffness: float,
     out: np.ndarray,
-) -> None:
+) -> float:
     """Extrapolate along the last motion: F = F_i + s (F_i - F_{i-1}).
 
     s = (P - P_i).(P_i - P_{i-1}) / |P_i - P_{i-1}|^2.
@@ -87,6 +91,9 @@ def position_linear(
         forces: F_{i-1}, F_i [N], shape (2, 3).
         max_stiffness: largest |F_i - F_{i-1}| / |P_i - P_{i-1}| that is accepted [N/m].
         out: F [N], shape (3,).
+
+    Returns:
+        s.
     """
     squared = along = change = 0.0
     for k in range(3):
@@ -103,36 +110,57 @@ def position_linear(
             s *= steepest / change
     for k in range(3):
         out[k] = forces[1, k] + s * (forces[1, k] - forces[0, k])
+    return s
 
 
 @inner
-def local_stiffness(
+def local_blade(
     position: np.ndarray,
-    at: np.ndarray,
-    force: np.ndarray,
-    stiffness: np.ndarray,
+    arms: np.ndarray,
+    history: np.ndarray,
     max_stiffness: float,
     out: np.ndarray,
+    torque: np.ndarray,
 ) -> None:
-    """Extrapolate by a stiffness: F = F_i - K (P - P_i).
+    """Extrapolate by a stiffness that is spread evenly over what of the blade is in the tissue.
+
+    A place s of the blade (0 at its tip, 1 at its root) has moved by d(s) = d_0 + s (d_1 - d_0).
+    With the means over the places in the tissue, the force is F = F_i - K mean(d), its first moment
+    G = G_i - K mean(s d), and the torque about the tip e x G, where e leads from tip to root. A
+    blade that is not turned has moved by P - P_i everywhere.
 
     K is scaled down where its Frobenius norm exceeds the stiffness that the device renders.
 
     Args:
         position: P [m], shape (3,).
-        at: P_i [m], shape (3,).
-        force: F_i [N], shape (3,).
-        stiffness: K [N/m], shape (3, 3).
+        arms: from there to root and tip of the blade [m], shape (2, 3).
+        history: dtype HISTORY, shape (1,).
         max_stiffness: [N/m].
         out: F [N], shape (3,).
+        torque: [N m], shape (3,).
     """
-    norm = np.sqrt(np.sum(stiffness * stiffness))
+    h = history[0]
+    norm = np.sqrt(np.sum(h.stiffness * h.stiffness))
     scale = max_stiffness / norm if norm > max_stiffness else 1.0
+    mean, square = h.immersed[0], h.immersed[1]
+    before, now = h.arms[0] - h.arms[1], arms[0] - arms[1]
+    length = before[0] ** 2 + before[1] ** 2 + before[2] ** 2
+    moved, first, moment = np.empty(3), np.empty(3), np.zeros(3)
+    if length > 0.0:
+        moment = np.cross(h.torque[1], before) / length
     for k in range(3):
-        pull = 0.0
+        way, turned = position[k] - h.position[1, k], now[k] - before[k]
+        there = arms[1, k] - h.arms[1, k]
+        moved[k] = way + (there + mean * turned)
+        first[k] = mean * (way + there) + square * turned
+    for k in range(3):
+        pull = spread = 0.0
         for j in range(3):
-            pull += stiffness[k, j] * (position[j] - at[j])
-        out[k] = force[k] - scale * pull
+            pull += h.stiffness[k, j] * moved[j]
+            spread += h.stiffness[k, j] * first[j]
+        out[k] = h.force[1, k] - scale * pull
+        moment[k] -= scale * spread
+    torque[:] = np.cross(now, moment)
 
 
 @inner
@@ -215,10 +243,12 @@ def estimate(
     position: np.ndarray,
     depth: np.ndarray,
     touching: bool,
+    arms: np.ndarray,
     max_stiffness: float,
     out: np.ndarray,
+    torque: np.ndarray,
 ) -> None:
-    """Compute the force at (time, position) by one of `LAWS`.
+    """Compute force and torque at (time, position) by one of `LAWS`.
 
     A single sample has no line: TIME holds it, POSITION follows the stiffness there.
 
@@ -229,8 +259,10 @@ def estimate(
         position: of the tool tip [m], shape (3,).
         depth: from there to the proxy [m], shape (3,).
         touching: the tool is on the surface, not in the tissue.
+        arms: from the tip to root and tip of the blade [m], shape (2, 3).
         max_stiffness: [N/m].
-        out: [N], shape (3,).
+        out: force [N], shape (3,).
+        torque: about the end of the blade at its tip [N m], shape (3,).
     """
     h = history[0]
     local = law == LOCAL_STIFFNESS or (law == POSITION and h.count < 2)
@@ -240,13 +272,17 @@ def estimate(
         here = stiffness_along_path(h.stiffness, h.depth, h.force[1], path, max_stiffness)
         local_surface(depth, h.depth, h.force[1], k, here, out)
     elif local:
-        local_stiffness(position, h.position[1], h.force[1], h.stiffness, max_stiffness, out)
+        local_blade(position, arms, history, max_stiffness, out, torque)
     elif law == TIME and h.count == 2:
         time_linear(time, h.time, h.force, out)
+        time_linear(time, h.time, h.torque, torque)
     elif law == POSITION:
-        position_linear(position, h.position, h.force, max_stiffness, out)
+        s = position_linear(position, h.position, h.force, max_stiffness, out)
+        for k in range(3):
+            torque[k] = h.torque[1, k] + s * (h.torque[1, k] - h.torque[0, k])
     else:
         constant(h.force[1], out)
+        constant(h.torque[1], torque)
 
 
 def clear(history: np.ndarray) -> None:
@@ -264,6 +300,9 @@ def push(
     *,
     topology: int,
     state: int,
+    torque: np.ndarray = _NONE,
+    arms: np.ndarray = _NONE,
+    immersed: np.ndarray = _NONE[:2],
 ) -> None:
     """Add a sample. A change of connectivity or of the contact's state removes older samples.
 
@@ -277,15 +316,19 @@ def push(
         depth: from tip to proxy in the contact that the sample answers [m], shape (3,).
         topology: connectivity count of the mesh that the sample stems from.
         state: contact state that it stems from.
+        torque: [N m], shape (3,).
+        arms: from the tool's tip to root and tip of the blade in that contact [m], shape (2, 3).
+        immersed: as in `TissueSample`, shape (2,).
     """
     h = history[0]
     same = h['topology'] == topology and h['state'] == state
     h['count'] = min(h['count'] + 1, 2) if same else 1
-    for name, value in (('time', time), ('position', position), ('force', force)):
+    values = (('time', time), ('position', position), ('force', force), ('torque', torque))
+    for name, value in values:
         h[name][0] = h[name][1]
         h[name][1] = value
     if np.any(stiffness):
         h['stiffness'] = stiffness
-    h['depth'] = depth
+    h['depth'], h['arms'], h['immersed'] = depth, arms, immersed
     h['topology'] = topology
     h['state'] = state

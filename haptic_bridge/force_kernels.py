@@ -1,5 +1,7 @@
 """The compiled part of one tick: pose to tissue frame, force law, safety chain, force to device."""
 
+import math
+
 import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, safety
@@ -45,6 +47,9 @@ SETUP = record_type(
         ('max_damping', 'f8'),  # [N s/m]
         ('max_force', 'f8'),  # [N]
         ('max_slew', 'f8'),  # [N/s]
+        ('length', 'f8'),  # [m] of the blade, in the tissue
+        ('hand_length', 'f8'),  # [m] the same at the hand; 0: the device renders no torque
+        ('max_torque', 'f8'),  # [N m]
         ('body_frame', 'i8'),
     ]
 )
@@ -54,12 +59,15 @@ STATE = record_type(
         ('orientation', 'f8', (4,)),  # x y z w, device frame
         ('tip', 'f8', (3,)),  # [m], tissue frame
         ('blade', 'f8', (2, 3)),  # root and tip [m], tissue frame
+        ('arms', 'f8', (2, 3)),  # [m] from the tip to root and tip of the blade, tissue frame
         ('moved', 'f8', (3,)),  # [m] since the last tick, device frame
-        ('velocity', 'f8', (3,)),  # [m/s], device frame
+        ('turned', 'f8', (3,)),  # [rad] since the last tick, rotation vector, device frame
+        ('velocity', 'f8', (6,)),  # [m/s], angular velocity times `hand_length`, device frame
         ('proxy', 'f8', (3,)),  # [m] on the undented surface
         ('normal', 'f8', (3,)),
         ('external', 'f8', (3,)),  # [N] on the tissue
         ('resistance', 'f8'),  # [N]
+        ('torque_resistance', 'f8'),  # [N m]
         ('known', 'f8'),  # [N/m] stiffness of the tissue; 0: unknown
         ('held', 'f8'),  # [N] largest force that can hold the blade
         ('reach', 'f8'),  # share of the resistance that a blade so far from the surface may feel
@@ -68,7 +76,8 @@ STATE = record_type(
         ('energy', 'f8'),  # [J] of the passivity observer
         ('damping', 'f8'),  # [N s/m] of the passivity controller
         ('force', 'f8', (3,)),  # [N] commanded, device base frame
-        ('wrench', 'f8', (3,)),  # [N] the same in the frame that the device expects
+        ('torque', 'f8', (3,)),  # [N m] commanded, about the tip, device base frame
+        ('wrench', 'f8', (6,)),  # [N, N m] the same in the frame that the device expects
     ]
 )
 
@@ -96,6 +105,9 @@ def make_setup(
     setup['max_damping'] = haptics.max_damping
     setup['max_force'] = profile.max_force
     setup['max_slew'] = profile.max_slew
+    length = math.dist(tool.blade_root, tool.blade_tip)
+    setup['length'], setup['max_torque'] = length, profile.max_torque
+    setup['hand_length'] = length / frame.scale if profile.max_torque > 0.0 else 0.0
     setup['body_frame'] = device.force_frame == 'body'
     return setup
 
@@ -114,6 +126,23 @@ def _rotate(q: np.ndarray, v: np.ndarray, sign: float, out: np.ndarray) -> None:
     )
 
 
+@inner
+def _add_turn(before: np.ndarray, after: np.ndarray, turned: np.ndarray) -> None:
+    """Add the rotation vector [rad] between two quaternions (x y z w), in their base frame."""
+    a, b = after, before
+    cosine = b[3] * a[3] + b[0] * a[0] + b[1] * a[1] + b[2] * a[2]
+    axis = np.empty(3)
+    axis[0] = b[3] * a[0] - a[3] * b[0] + b[1] * a[2] - b[2] * a[1]
+    axis[1] = b[3] * a[1] - a[3] * b[1] + b[2] * a[0] - b[0] * a[2]
+    axis[2] = b[3] * a[2] - a[3] * b[2] + b[0] * a[1] - b[1] * a[0]
+    sine = safety.norm(axis)
+    if sine == 0.0:
+        return
+    angle = 2.0 * np.arctan2(sine, abs(cosine))
+    for k in range(3):
+        turned[k] += angle / sine * (axis[k] if cosine >= 0.0 else -axis[k])
+
+
 @kernel(nogil=True)
 def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
     """Write a checked device pose, transformed to the tissue frame, to the state.
@@ -124,6 +153,7 @@ def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
     for k in range(3):
         s.moved[k] += values[k] - s.device[k]
         s.device[k] = values[k]
+    _add_turn(s.orientation, values[3:], s.turned)
     for k in range(4):
         s.orientation[k] = values[3 + k]
     arm = np.empty(3)
@@ -135,8 +165,10 @@ def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
         _rotate(s.orientation, c.blade[end], 1.0, arm)
         for k in range(3):
             s.blade[end, k] = s.tip[k]
+            s.arms[end, k] = 0.0
             for j in range(3):
                 s.blade[end, k] += c.rotation[k, j] * arm[j]
+                s.arms[end, k] += c.rotation[k, j] * arm[j]
 
 
 @inner
@@ -147,16 +179,22 @@ def _tissue_force(
     contact: int,
     time: int,
     out: np.ndarray,
+    torque: np.ndarray,
 ) -> None:
-    """Compute the force of the tissue on the tool now [N], tissue frame, shape (3,)."""
+    """Compute force and torque of the tissue on the tool now, tissue frame.
+
+    Force [N] and torque about the tool's tip [N m], shape (3,).
+    """
     c, s, h = setup[0], state[0], history[0]
-    out[:] = 0.0
+    out[:], torque[:] = 0.0, 0.0
     if contact == NONE:
         return
     if h.count > 0 and not (c.one_force and contact == TOUCHING):
         depth = s.proxy - s.tip
         touching = contact == TOUCHING
-        extrapolation.estimate(c.law, history, time, s.tip, depth, touching, c.max_stiffness, out)
+        extrapolation.estimate(
+            c.law, history, time, s.tip, depth, touching, s.arms, c.max_stiffness, out, torque
+        )
     elif contact == TOUCHING:
         for k in range(3):
             out[k] = -s.external[k]  # until the tissue has answered
@@ -174,6 +212,10 @@ def _tissue_force(
         # The blade transmits at most the cutting resistance: zero while no part is in tissue.
         # It may exceed the last bound only by the stretch of its spring since then.
         safety.clamp(min(s.reach * s.resistance, s.held), out)
+        safety.clamp(min(s.reach * s.torque_resistance, s.held * c.length), torque)
+        torque[0] += s.arms[1, 1] * out[2] - s.arms[1, 2] * out[1]
+        torque[1] += s.arms[1, 2] * out[0] - s.arms[1, 0] * out[2]
+        torque[2] += s.arms[1, 0] * out[1] - s.arms[1, 1] * out[0]
 
 
 @inner
@@ -217,38 +259,50 @@ def command(
     gain: float,
     elapsed: float,
 ) -> bool:
-    """Compute the commanded force and wrench from a checked input, through the safety chain.
+    """Compute the commanded force and torque from a checked input, through the safety chain.
 
     Returns:
-        False where the result was not finite; the force is then zero.
+        False where the result was not finite; force and torque are then zero.
     """
     c, s = setup[0], state[0]
     s.energy = safety.observe(s.energy, s.force, s.moved)
+    s.energy = safety.observe(s.energy, s.torque, s.turned)
     weight = elapsed / (elapsed + _VELOCITY_FILTER_S)
     for k in range(3):
         s.velocity[k] += weight * (s.moved[k] / elapsed - s.velocity[k])
-        s.moved[k] = 0.0
+        spin = c.hand_length * s.turned[k] / elapsed
+        s.velocity[3 + k] += weight * (spin - s.velocity[3 + k])
+        s.moved[k] = s.turned[k] = 0.0
     spring_force(history[0].stiffness, c.coupling, s.tip, s.proxy, s.external)
     _follow_edge(setup, state)
-    felt = np.zeros(3)
-    wanted = np.zeros(3)
-    _tissue_force(setup, state, history, contact, time, felt)
+    felt, torque = np.zeros(3), np.zeros(3)
+    wanted = np.zeros(6)  # the torque over the length of the blade at the hand: a force
+    _tissue_force(setup, state, history, contact, time, felt, torque)
+    # A turn is not scaled as a way is: the hand's torque does the work that its force does.
+    lever = c.force_scale / (c.scale * c.hand_length) if c.hand_length > 0.0 else 0.0
     for k in range(3):
         for j in range(3):
             wanted[k] += c.force_scale * c.rotation[j, k] * felt[j]
+            wanted[3 + k] += lever * c.rotation[j, k] * torque[j]
     safety.state_gate(enabled, wanted)
     s.damping = 0.0
     if enabled and contact != NONE:
         s.damping = safety.control(
             s.energy, s.velocity, _PASSIVITY_RECOVERY_S, c.max_damping, wanted
         )
-    safety.settle(s.force, c.max_slew * elapsed, c.max_force, gain, wanted)
-    finite = np.isfinite(safety.norm(wanted))
+    force, turning = wanted[:3], wanted[3:] * c.hand_length
+    safety.settle(s.force, c.max_slew * elapsed, c.max_force, gain, force)
+    # The torque goes from zero to its largest in the time in which the force does.
+    step = c.max_slew * elapsed * c.max_torque / c.max_force
+    safety.settle(s.torque, step, c.max_torque, gain, turning)
+    finite = np.isfinite(safety.norm(force) + safety.norm(turning))
     for k in range(3):
-        s.force[k] = wanted[k] if finite else 0.0
+        s.force[k] = force[k] if finite else 0.0
+        s.torque[k] = turning[k] if finite else 0.0
     if c.body_frame:
-        _rotate(s.orientation, s.force, -1.0, s.wrench)
+        _rotate(s.orientation, s.force, -1.0, s.wrench[:3])
+        _rotate(s.orientation, s.torque, -1.0, s.wrench[3:])
     else:
         for k in range(3):
-            s.wrench[k] = s.force[k]
+            s.wrench[k], s.wrench[3 + k] = s.force[k], s.torque[k]
     return finite

@@ -93,12 +93,13 @@ class ForcePath:
         self._setup = force_kernels.make_setup(tool, device, haptics, profile)
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
-        names = ('force', 'wrench', 'tip', 'external', 'blade')
-        self._force, self._wrench, self._tip, self._external, self._blade = map(
+        names = ('force', 'wrench', 'tip', 'external', 'blade', 'arms')
+        self._force, self._wrench, self._tip, self._external, self._blade, self._arms = map(
             self._s.__getitem__, names
         )
         self._plausibility = ContactPlausibility(tool, tool.coupling_stiffness)
-        self._max_resistance = edge_resistance * math.dist(tool.blade_root, tool.blade_tip)
+        self._length = math.dist(tool.blade_root, tool.blade_tip)
+        self._max_resistance = edge_resistance * self._length
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._grips = friction.sliding > 0.0
         self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
@@ -112,6 +113,7 @@ class ForcePath:
         self._undented = UndentedSurface()
         self._sequence = self._began = self._left = 0
         self._depths = np.zeros((_MAX_PENDING_CONTACTS, 3))
+        self._past_arms = np.zeros((_MAX_PENDING_CONTACTS, 2, 3))
         self._contact = NONE
         self._was_enabled = self._stale = False
 
@@ -217,7 +219,7 @@ class ForcePath:
         gain = self._gain(now_ns, enabled)
         touched = self._touch(now_ns, surface, enabled)
         if fault or state is CrtkState.FAULT:
-            self._s['force'] = 0.0
+            self._s['force'] = self._s['torque'] = 0.0
         if not force_kernels.command(
             self._setup,
             self._state,
@@ -232,7 +234,6 @@ class ForcePath:
         if self._contact != NONE:
             self.contact_time += elapsed
         self.max_force = max(self.max_force, self.force_norm)
-        wrench = (*self._wrench.tolist(), 0.0, 0.0, 0.0)
         contact = contact_values(
             self._sequence,
             self._contact,
@@ -241,7 +242,7 @@ class ForcePath:
             (self._tip, self._external, self._blade),
             self._tail,
         )
-        return Tick(wrench, contact, self._pose_stamp, fault)
+        return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
 
     def _take_pose(self, now_ns: int, pose: StampedMessage | None, enabled: bool) -> str:
         if pose is None:
@@ -261,7 +262,7 @@ class ForcePath:
             return safety.POSE_FAULTS[code]
         force_kernels.to_tissue(self._setup, self._state, self._pose)
         if not known:
-            self._s['moved'] = 0.0
+            self._s['moved'] = self._s['turned'] = 0.0
         self._pose_stamp, self._pose_ns = pose.stamp_ns, now_ns
         return ''
 
@@ -295,24 +296,31 @@ class ForcePath:
         self._sample_ns = sample_ns - _QUEUE_ALLOWANCE_NS
         self._sample_state = reaction.state
         self._s['resistance'] = min(reaction.resistance, self._max_resistance)
+        self._s['torque_resistance'] = min(
+            reaction.torque_resistance, self._max_resistance * self._length
+        )
         if reaction.state == INSIDE:
-            slack = float(self._setup['slack'][0])
-            self._s['held'] = min(self._s['held'], math.hypot(*reaction.force) + slack)
+            held = max(math.hypot(*reaction.force), math.hypot(*reaction.torque) / self._length)
+            self._s['held'] = min(self._s['held'], held + float(self._setup['slack'][0]))
         elif reaction.stiffness.any():
             reported = surface_stiffness(reaction.stiffness, self._tail[0])
             self._plausibility.update_stiffness(self._state, now_ns, reported)
         answered = self._began <= reaction.sequence <= self._sequence and self._contact == TOUCHING
         if reaction.state == INSIDE or answered:
-            there = self._depths[reaction.sequence % _MAX_PENDING_CONTACTS]
+            slot = reaction.sequence % _MAX_PENDING_CONTACTS
+            known = 0 <= self._sequence - reaction.sequence < _MAX_PENDING_CONTACTS
             extrapolation.push(
                 self._history,
                 reaction.time,
                 reaction.position,
                 reaction.force,
                 reaction.stiffness,
-                there,
+                self._depths[slot],
                 topology=reaction.topology,
                 state=reaction.state,
+                torque=reaction.torque,
+                arms=self._past_arms[slot] if known else self._arms,
+                immersed=reaction.immersed,
             )
         elif reaction.sequence > self._left and not self._history['count'][0]:
             # The reported state is of a place that the tool approaches, or has touched since.
@@ -355,6 +363,7 @@ class ForcePath:
     def _touch(self, now_ns: int, surface: Surface | None, enabled: bool) -> Any:
         """Move the proxy; return its contact or nearest triangle, None while it is unused."""
         self._sequence += 1
+        self._past_arms[self._sequence % _MAX_PENDING_CONTACTS] = self._arms
         self._follow(now_ns, surface)
         before = self._contact
         inside = enabled and self._sample_state == INSIDE and self._accepts_inside(now_ns, surface)

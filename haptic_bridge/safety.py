@@ -118,8 +118,8 @@ def observe(energy: float, force: np.ndarray, displacement: np.ndarray) -> float
 
     Args:
         energy: before [J].
-        force: on the hand, commanded since the last tick [N], shape (3,).
-        displacement: of the hand since then [m], shape (3,).
+        force: on the hand, commanded since the last tick [N], or torque [N m], shape (3,).
+        displacement: of the hand since then [m], or rotation vector, shape (3,).
     """
     return energy - (
         force[0] * displacement[0] + force[1] * displacement[1] + force[2] * displacement[2]
@@ -136,21 +136,21 @@ def control(
 
     Args:
         energy: of the observer [J]; the controller acts only where it is negative.
-        velocity: of the hand [m/s], shape (3,).
+        velocity: of the hand [m/s], and its angular velocity times a length, shape (3,) or (6,).
         period: [s].
         max_damping: bound of the damping [N s/m].
-        force: on the hand [N], shape (3,), changed in place.
+        force: on the hand [N], and its torque over that length, same shape, changed in place.
 
     Returns:
         The damping [N s/m].
     """
     if energy >= 0.0:
         return 0.0
-    squared = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
+    squared = np.sum(velocity * velocity)
     damping = max_damping
     if squared * period * max_damping > -energy:
         damping = -energy / (squared * period)
-    for k in range(3):
+    for k in range(len(force)):
         force[k] -= damping * velocity[k]
     return damping
 

@@ -107,7 +107,9 @@ class DeviceSettings(SceneModel):
         return DeviceProfile.load(share_folder() / 'config' / 'devices' / f'{self.profile}.yaml')
 
 
-LimitName = Literal['max_force', 'max_slew', 'max_stiffness', 'workspace']
+LimitName = Literal[
+    'max_force', 'max_slew', 'max_stiffness', 'max_torque', 'max_torsional_stiffness', 'workspace'
+]
 
 
 class DeviceProfile(SceneModel):
@@ -118,6 +120,12 @@ class DeviceProfile(SceneModel):
     max_slew: float = Field(gt=0, le=100_000, description='[N/s] largest rate of the force')
     max_stiffness: float = Field(
         gt=0, le=50_000, description='[N/m] largest stiffness that it renders stably'
+    )
+    max_torque: float = Field(
+        0.0, ge=0, le=10, description='[N m] largest norm ever commanded; 0: it renders no torque'
+    )
+    max_torsional_stiffness: float = Field(
+        0.0, ge=0, le=100, description='[N m/rad] largest stiffness that it renders stably'
     )
     workspace: tuple[Edge, Edge, Edge] | None = Field(
         None, description='[m] edges of the box in which the tip can be; without it, unknown'
@@ -221,4 +229,14 @@ def check_together(
         raise SettingsError(
             f'tool.coupling_stiffness: {tool.coupling_stiffness:g} N/m is {felt:g} N/m at the '
             f'hand, but the device bears {profile.max_stiffness:g} N/m (max_stiffness)'
+        )
+    # Springs of twice the coupling's stiffness, spread over the blade, turned about its end.
+    length = np.linalg.norm(np.subtract(tool.blade_root, tool.blade_tip))
+    turned = 2 / 3 * tool.coupling_stiffness * length**2
+    turned *= haptics.force_scale / device.tissue_from_device.scale
+    if profile.max_torque > 0 and turned > profile.max_torsional_stiffness:
+        raise SettingsError(
+            f'tool.coupling_stiffness: a blade of {length:g} m is {turned:.3g} N m/rad stiff at '
+            f'the hand, but the device bears {profile.max_torsional_stiffness:g} N m/rad '
+            '(max_torsional_stiffness)'
         )

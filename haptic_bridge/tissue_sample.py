@@ -12,6 +12,8 @@ from cutting_trainer.tissue_sim.mesh.replica import MAX_COORDINATE
 
 MAX_FORCE_N = 1e3
 """[N]. A diverging simulation exceeds it long before it overflows."""
+MAX_TORQUE_N_M = 1e3
+"""[N m] Largest force on a blade of a metre."""
 MAX_STIFFNESS_N_M = 1e6
 """[N/m] in each direction: stiffness of bone, the largest that a hand can distinguish."""
 _MAX_COUNT = 2**63 - 1
@@ -31,6 +33,10 @@ class TissueSample(NamedTuple):
         stiffness: [N/m], shape (3, 3).
         resistance: largest force that the blade transmits [N].
         tool: number of the tool that feels it.
+        torque: about the end of the blade at its tip [N m], shape (3,).
+        torque_resistance: largest torque that the blade transmits [N m].
+        immersed: mean and mean square of the places along the blade, from 0 at its tip to 1 at its
+            root, that are in the tissue, shape (2,).
     """
 
     step: int
@@ -44,13 +50,17 @@ class TissueSample(NamedTuple):
     stiffness: np.ndarray
     resistance: float
     tool: int
+    torque: np.ndarray
+    torque_resistance: float
+    immersed: np.ndarray
 
     @classmethod
     def read(cls, sample: StampedMessage) -> 'TissueSample':
         """Decode a message."""
         step, revision, topology, sequence, seconds, nanoseconds, state = sample.values[:7]
-        position, force, stiffness = (
-            np.array(sample.values[_AT[name]]) for name in ('position', 'force', 'stiffness')
+        names = ('position', 'force', 'stiffness', 'torque', 'immersed')
+        position, force, stiffness, torque, immersed = (
+            np.array(sample.values[_AT[name]]) for name in names
         )
         return cls(
             int(step),
@@ -64,6 +74,9 @@ class TissueSample(NamedTuple):
             stiffness.reshape(3, 3),
             sample.values[_AT['resistance']][0],
             int(sample.values[_AT['tool']][0]),
+            torque,
+            sample.values[_AT['torque_resistance']][0],
+            immersed,
         )
 
     @property
@@ -74,6 +87,10 @@ class TissueSample(NamedTuple):
             ('stiffness', np.abs(self.stiffness).max(), MAX_STIFFNESS_N_M, 'N/m'),
             ('position', np.abs(self.position).max(), MAX_COORDINATE, 'm'),
             ('resistance', self.resistance, MAX_FORCE_N, 'N'),
+            ('torque', math.hypot(*self.torque), MAX_TORQUE_N_M, 'N m'),
+            ('torque_resistance', self.torque_resistance, MAX_TORQUE_N_M, 'N m'),
+            ('immersed', self.immersed.max(), 1.0, ''),
+            ('immersed', self.immersed.min(), 1.0, ''),
             ('state', self.state, INSIDE, ''),
             ('topology', self.topology, _MAX_COUNT, ''),
             ('tool', self.tool, TOOLS - 1, ''),

@@ -41,7 +41,8 @@ def warm_up(
         tip = frame.to_device(place + np.array([0.0, 0.0, height * tool.radius]))
         stamp = (i + 1) * 1_000_000
         pose = StampedMessage(stamp, '', (*tip.tolist(), 0.0, 0.0, 0.0, 1.0))
-        sample = StampedMessage(stamp, '', (i, i, 0, i, 0, stamp, TOUCHING) + (1e-3,) * 18 + (0,))
+        values = (i, i, 0, i, 0, stamp, TOUCHING, *(1e-3,) * 18, 0, *(1e-3,) * 6)
+        sample = StampedMessage(stamp, '', values)
         path.tick(stamp, state=state, pose=pose, sample=sample, surface=surface)
         surface = Surface(corners, triangle, revision=i + 1, topology=0, previous=surface)
         corners = corners + 1e-5

@@ -54,7 +54,7 @@ class StampedCodec:
 
     Attributes:
         layout: (field, struct code, count) of each field after the header.
-        added: number of fields at the end that messages of older bags lack; they are read as 0, and
+        older: numbers of fields that messages of older bags have; what they lack is read as 0, and
             may be left out of the values to encode.
         fields: position of each field in `StampedMessage.values`.
 
@@ -63,7 +63,7 @@ class StampedCodec:
     """
 
     layout: ClassVar[tuple[tuple[str, str, int], ...]] = ()
-    added: ClassVar[int] = 0
+    older: ClassVar[tuple[int, ...]] = ()
     fields: ClassVar[dict[str, slice]] = {}
 
     def __init_subclass__(cls) -> None:
@@ -78,7 +78,11 @@ class StampedCodec:
         self._frame = frame_id.encode() + b'\0'
         self._packer = _body(self.layout, len(self._frame))
         self._values = sum(count for _, _, count in self.layout)
-        self._bodies: dict[int, tuple[struct.Struct, struct.Struct]] = {}
+        self._counts = {
+            sum(count for _, _, count in self.layout[:fields]): fields
+            for fields in sorted((len(self.layout), *self.older))
+        }
+        self._bodies: dict[int, dict[int, struct.Struct]] = {}
         self._frames: dict[bytes, str] = {}
 
     def encode(self, stamp_ns: int, values: Sequence[float]) -> bytes:
@@ -92,7 +96,7 @@ class StampedCodec:
         left_out = self._values - len(values)
         try:
             head = _HEADER.pack(_ENCAPSULATION, seconds, nanoseconds, len(self._frame))
-            rest = (0,) * left_out if left_out <= self.added else ()
+            rest = (0,) * left_out if len(values) in self._counts else ()
             return head + self._packer.pack(self._frame, *values, *rest)
         except struct.error as error:
             raise WireError(
@@ -122,17 +126,21 @@ class StampedCodec:
                 size, most = length - 1, MAX_FRAME_ID_LENGTH
                 text = f'{self.name} has a frame_id of {size} bytes: {most} at most'
                 raise WireError('frame_id too long', text)
-            older = self.layout[: len(self.layout) - self.added]
-            bodies = self._bodies[length] = (_body(self.layout, length), _body(older, length))
-        body = bodies[size < _HEADER.size + bodies[0].size]
+            bodies = self._bodies[length] = {
+                count: _body(self.layout[:fields], length) for count, fields in self._counts.items()
+            }
+        whole = body = bodies[self._values]
+        if size < _HEADER.size + whole.size:
+            fitting = [b for b in bodies.values() if _HEADER.size + b.size <= size]
+            body = fitting[-1] if fitting else whole
         if not 0 <= size - _HEADER.size - body.size <= _MAX_TRAILING_PADDING:
             raise WireError(
                 'wrong length',
                 f'{self.name} with a frame_id of {length - 1} bytes has '
-                f'{_HEADER.size + bodies[0].size} bytes, got {size}',
+                f'{_HEADER.size + whole.size} bytes, got {size}',
             )
         frame, *values = body.unpack_from(data, _HEADER.size)
-        if body is not bodies[0]:
+        if body is not whole:
             values += [0] * (self._values - len(values))
         name = self._frames.get(frame)
         if name is None:
@@ -229,7 +237,7 @@ class ContactCodec(StampedCodec):
         ('proxy_radius', 'd', 1),
         ('tool', 'B', 1),
     )
-    added = 1
+    older = (15,)
 
 
 class ForceSampleCodec(StampedCodec):
@@ -250,5 +258,8 @@ class ForceSampleCodec(StampedCodec):
         ('kinetic_energy', 'd', 1),
         ('elastic_energy', 'd', 1),
         ('tool', 'B', 1),
+        ('torque', 'd', 3),
+        ('torque_resistance', 'd', 1),
+        ('immersed', 'd', 2),
     )
-    added = 1
+    older = (13, 14)

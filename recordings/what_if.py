@@ -296,9 +296,7 @@ def _show(computed: Resimulation, hand: Hand, frame: Frame) -> None:
     sequence = 0 if hand.contact is None else int(hand.contact.values[0])
     stamp = 0 if hand.contact is None else hand.contact.stamp_ns
     head = (frame.step, frame.step, simulation.mesh.topology, sequence)
-    vectors = (*frame.position, *frame.force, *frame.stiffness.ravel())
-    energies = (frame.resistance, frame.kinetic_energy, frame.elastic_energy)
-    values = (*head, *divmod(stamp, 1_000_000_000), int(frame.state), *vectors, *energies, 0)
+    values = (*head, *divmod(stamp, 1_000_000_000), *frame.felt)
     hand.sample = StampedMessage(max(stamp, 1), '', values)
     hand.surface = Surface(
         simulation.positions,

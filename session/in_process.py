@@ -238,10 +238,8 @@ class InProcess:
     def _sample_of(self, frame: Frame, sequence: int, stamp: int) -> StampedMessage:
         topology = self.tissue.simulation.mesh.topology
         head = (frame.step, frame.step, topology, sequence, *divmod(stamp, 10**9))
-        vectors = np.concatenate([frame.position, frame.force, frame.stiffness.ravel()])
-        tail = (frame.resistance, frame.kinetic_energy, frame.elastic_energy, 0)
         end = _START_NS + self.ticks * _NS
-        return StampedMessage(end, 'tissue', (*head, int(frame.state), *vectors.tolist(), *tail))
+        return StampedMessage(end, 'tissue', (*head, *frame.felt))
 
 
 def make_force_path(scene: Scene) -> ForcePath:

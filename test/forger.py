@@ -47,7 +47,9 @@ def forged_sample(rng: np.random.Generator, rig: Rig) -> StampedMessage:
     state = int(rng.choice([NONE, TOUCHING, INSIDE], p=[0.1, 0.4, 0.5]))
     revision = rig.step + int(rng.integers(0, 3))
     head = (step, revision, topology, max(sequence, 0), *divmod(rig.now, 10**9), state)
-    values = (*head, *place, *push, *stiffness.ravel(), rng.choice([0.0, 1.0, 1000.0]), 0.0, 0.0, 0)
+    most = rng.choice([0.0, 1.0, 1000.0])
+    turning = (*(0.1 * push), most, 0.5, 0.3)
+    values = (*head, *place, *push, *stiffness.ravel(), most, 0.0, 0.0, 0, *turning)
     return StampedMessage(
         rig.now, 'tissue', tuple(float(v) if i > 6 else v for i, v in enumerate(values))
     )

@@ -88,7 +88,7 @@ class Rig:
         sample = StampedMessage(
             self.now,
             'tissue',
-            (*head, *device, 0.0, 0.0, K * depth, *stiffness, 0.3, 0.0, 0.0, 0),
+            (*head, *device, 0.0, 0.0, K * depth, *stiffness, 0.3, 0.0, 0.0, 0, *(0.0,) * 6),
         )
         return self.spoil(sample)
 

@@ -73,8 +73,8 @@ def turn(rate: float, seconds: float = 1.0) -> tuple[float, float]:
             continue
         if last is not None:
             work += 0.5 * (blade.force + last[0]) @ (tip - last[2])
-            work += 0.5 * (blade.torque + last[1])[1] * (angle - last[3])
-        last = blade.force, blade.torque, tip, angle
+            work -= 0.5 * (frame.turning.torque + last[1])[1] * (angle - last[3])
+        last = blade.force, frame.turning.torque, tip, angle
         v, c = simulation.velocity, simulation.material
         lost += c.beta * float(np.sum(v * simulation.model.force(v))) / rate
         lost += c.alpha * float(simulation.model.mass @ np.square(v).sum(axis=1)) / rate

@@ -48,7 +48,7 @@ def push(h, time, position, force, k=0.0, depth=(0, 0, 0), **where):
 def estimate(law, h, time, position, depth=(0, 0, 0), touching=True, limit=STIFF):
     out = np.zeros(3)
     at, d = np.array(position, float), np.array(depth, float)
-    ex.estimate(law, h, time, at, d, touching, limit, out)
+    ex.estimate(law, h, time, at, d, touching, np.zeros((2, 3)), limit, out, np.zeros(3))
     return out
 
 
@@ -118,20 +118,47 @@ def test_time_law_is_bounded_in_reach_and_holds_when_the_clock_stands():
     assert time_law(1.0, [(FRAME, 0.0), (FRAME, 1.0)]) == 1.0
 
 
+def blade_law(at, k, limit=STIFF, arms=((0.0,) * 3,) * 2, torque=(0.0,) * 3, force=(0.0,) * 3):
+    """Law from a sample at the origin, of a blade from z = -1 to 2 cm whose lower half is held."""
+    h = np.zeros(1, ex.HISTORY)
+    before = np.array([[0, 0, 0.02], [0, 0, -0.01]])
+    where = {'topology': 1, 'state': 2, 'torque': torque, 'arms': before}
+    zero = np.zeros(3)
+    ex.push(h, 0, zero, np.array(force), k, zero, immersed=np.array([0.25, 1 / 12]), **where)
+    out, turning = np.zeros(3), np.zeros(3)
+    at, law = np.array(at, float), ex.LOCAL_STIFFNESS
+    ex.estimate(law, h, 0, at, zero, False, before + arms, limit, out, turning)
+    return out, turning
+
+
 def test_local_stiffness_is_exact_for_a_linear_tissue_in_every_direction():
     k = np.array([[40.0, 5, 0], [5, 60, -3], [0, -3, 80]])
-    at, force = np.array([1e-3, 0, -2e-3]), np.array([0.0, 0.1, 0.2])
-    moved = np.array([0.4e-3, -0.2e-3, 1e-3])
-    out = np.zeros(3)
-    ex.local_stiffness(at + moved, at, force, k, STIFF, out)
+    force, moved = np.array([0.0, 0.1, 0.2]), np.array([0.4e-3, -0.2e-3, 1e-3])
+    out, _ = blade_law(moved, k, force=force)
     np.testing.assert_allclose(out, force - k @ moved)
 
 
-def test_local_stiffness_is_no_stiffer_than_the_device_renders():
-    out = np.zeros(3)
-    ex.local_stiffness(
-        np.array([0, 0, -1e-3]), np.zeros(3), np.zeros(3), 5000 * np.eye(3), 400.0, out
+def test_a_turned_blade_feels_the_springs_along_what_of_it_is_in_the_tissue():
+    rng = np.random.default_rng(4)
+    k = np.diag([40.0, 60.0, 80.0])
+    moved, angle = 1e-3 * rng.normal(size=3), 1e-3 * np.array([1.0, -0.7, 0.0])
+    force, per_place = np.array([0.05, 0.02, 0.0]), np.array([0.05, 0.02, 0.0])
+    arms = np.array([np.cross(angle, a) for a in ([0, 0, 0.02], [0, 0, -0.01])])
+    edge = np.array([0, 0, 0.03])
+    out, torque = blade_law(
+        moved, k, arms=arms, torque=np.cross(0.25 * edge, per_place), force=force
     )
+    places = (np.arange(5000) + 0.5) / 10000
+    ways = moved + arms[1] + places[:, None] * (arms[0] - arms[1])
+    pulls = per_place - ways @ k
+    now = edge + arms[0] - arms[1]
+    np.testing.assert_allclose(out, pulls.mean(axis=0), rtol=1e-6, atol=1e-9)
+    expected = np.cross(now, (places[:, None] * pulls).mean(axis=0))
+    np.testing.assert_allclose(torque, expected, rtol=1e-4, atol=1e-9)
+
+
+def test_local_stiffness_is_no_stiffer_than_the_device_renders():
+    out, _ = blade_law([0, 0, -1e-3], 5000 * np.eye(3), limit=400.0)
     assert np.linalg.norm(out) <= 400.0 * 1e-3
 
 

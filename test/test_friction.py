@@ -68,7 +68,7 @@ class Ground:
         stiffness = np.diag([self.along, self.along, RIGID])
         head = (self.ms // 33, self.ms // 33, 1, self.values[0], *divmod(self.now, 10**9))
         state = TOUCHING if depth > 0 else NONE
-        body = (*device, 0.0, 0.0, RIGID * depth, *stiffness.ravel(), 0.0, 0.0, 0.0, 0)
+        body = (*device, 0.0, 0.0, RIGID * depth, *stiffness.ravel(), 0.0, 0.0, 0.0, 0, *(0.0,) * 6)
         return StampedMessage(self.now, 'tissue', (*head, state, *body))
 
     def pressed(self, depth, ms=400):

@@ -333,7 +333,8 @@ def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
                 replica.load(message)
             while (message := ros.take(deltas)) is not None:
                 replica.apply(message)
-            heard += ros.take_raw(forces) is not None
+            # The bag is older than the torque in this message.
+            heard += (sample := ros.take(forces)) is not None and not sample.torque.any()
             assert ros.take_raw(wrenches) is None
             time.sleep(0.002)
         assert playhead.over and heard > 20 and replica.step > 100

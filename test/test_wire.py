@@ -14,6 +14,7 @@ from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
+    StampedCodec,
     TwistStampedCodec,
     WireError,
     WrenchStampedCodec,
@@ -97,12 +98,26 @@ def test_fields_are_named_as_in_the_message(codec):
             assert list(values[where]) == flat(getattr(message, name))
 
 
-@pytest.mark.parametrize('codec', [ContactCodec, ForceSampleCodec], ids=lambda c: c.__name__)
-def test_messages_of_older_bags_are_about_the_first_tool(codec):
-    values = tuple(range(1, sum(count for _, _, count in codec.layout)))
-    data = codec('tissue').encode(5, values)
-    assert codec().decode(data) == codec().decode(data[:-1]) == (5, 'tissue', (*values, 0))
-    for wrong in (values[:-1], (*values, 0, 0)):
+@pytest.mark.parametrize(
+    ('codec', 'older'),
+    [
+        (ContactCodec, 'tool'),
+        (ForceSampleCodec, 'tool'),
+        (ForceSampleCodec, 'torque'),
+    ],
+)
+def test_what_messages_of_older_bags_lack_is_zero(codec, older):
+    names = [name for name, _, _ in codec.layout]
+    count = codec.fields[older].start
+    values = tuple(range(1, count + 1))
+
+    class Older(StampedCodec):
+        layout = codec.layout[: names.index(older)]
+
+    data, lacking = Older('tissue').encode(5, values), codec.fields[names[-1]].stop - count
+    assert codec().decode(data) == (5, 'tissue', (*values, *(0,) * lacking))
+    assert codec().decode(codec('tissue').encode(5, values)) == codec().decode(data)
+    for wrong in (values[:-2], (*values, *(0,) * (lacking + 1))):
         with pytest.raises(WireError, match='flat numbers'):
             codec('tissue').encode(5, wrong)
     with pytest.raises(WireError, match='wrong length'):

@@ -30,9 +30,9 @@ class Subject(NamedTuple):
 
 SUBJECTS = {
     'blade': Subject(
-        modules=('blade_severance',),
+        modules=('blade_severance', 'blade_law'),
         not_covered={
-            3: 'the law of the blade is not measured here',
+            3: 'of the law: edge, spine and flat do not differ',
             4: 'the force in the hand is not measured here',
             5: 'it needs a live session under load',
             6: 'the cut faces are not measured here',

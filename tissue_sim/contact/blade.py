@@ -8,7 +8,7 @@ existing cut, the blade pays friction alone (docs/method.md).
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -69,6 +69,24 @@ class Resistance:
     friction: float
 
 
+class Turning(NamedTuple):
+    """What a tool feels of being turned.
+
+    Attributes:
+        torque: of the tissue on the tool about the tip of its blade [N m], shape (3,).
+        resistance: largest torque that the blade transmits [N m].
+        immersed: mean and mean square of the places along the blade, from 0 at its tip to 1 at its
+            root, that are in the tissue, shape (2,).
+    """
+
+    torque: np.ndarray
+    resistance: float
+    immersed: np.ndarray
+
+
+NOT_TURNED = Turning(np.zeros(3), 0.0, np.zeros(2))
+
+
 class Blade:
     """The blade's edge in the tissue, from entry to exit.
 
@@ -81,7 +99,7 @@ class Blade:
         immersed: length of the edge in the tissue [m].
         limit: largest force that the edge transmits as it is pulled, or would as it is moved [N].
         force: of the edge on the tissue [N], shape (3,).
-        torque: the same about the tip of the device's edge [N m], shape (3,).
+        turning: force and limit as a torque about the tip of the device's edge.
         lag: mean distance of the edge from the device's, where it is in the tissue [m].
         paid: work of cutting since entry, toughness times swept area [J].
         rubbed: work of friction since entry [J].
@@ -238,12 +256,16 @@ class Blade:
         root, tip = self._device
         self._tip = tip - pull.line[0]
         self._edge = root - tip - pull.line[1]
-        self.force, self.torque = pull.force, pull.torque
+        self.force = pull.force
+        spans = self._state.spans
+        shares = spans / spans.sum() if spans.any() else spans
+        immersed = np.array([shares @ SHARES, shares @ SHARES**2])
+        self.turning = Turning(-pull.torque, float(pull.torque_limit), immersed)
         self.limit, self.lag = float(pull.limit), float(pull.lag)
         self.paid += float(pull.paid)
         self.rubbed += float(pull.rubbed)
         length = float(np.linalg.norm(root - tip)) / POINTS
-        self.immersed = length * float(self._state.spans.sum())
+        self.immersed = length * float(spans.sum())
 
     def sweep(self) -> Sweep | None:
         """Return the sweep of the edge since the last `confirm_sweep`; None if it is negligible."""

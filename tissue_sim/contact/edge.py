@@ -92,6 +92,7 @@ class Pull(NamedTuple):
         force: on the tissue [N], shape (3,).
         torque: the same about the tip of the device's edge [N m], shape (3,).
         limit: largest force of the edge as it is pulled, or would as it is moved [N].
+        torque_limit: largest torque about the tip in the same way [N m].
         line: lag of the tip, and how much more the root lags [m], shape (2, 3).
         lag: mean distance in the tissue [m].
         paid, rubbed: work of cutting and of friction [J].
@@ -100,6 +101,7 @@ class Pull(NamedTuple):
     force: np.ndarray
     torque: np.ndarray
     limit: float
+    torque_limit: float
     line: np.ndarray
     lag: float
     paid: float
@@ -109,7 +111,7 @@ class Pull(NamedTuple):
 @inner
 def no_pull(paid, rubbed):
     """Return the `Pull` of an edge in the air, with the works so far [J]."""
-    return Pull(np.zeros(3), np.zeros(3), 0.0, np.zeros((2, 3)), 0.0, paid, rubbed)
+    return Pull(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros((2, 3)), 0.0, paid, rubbed)
 
 
 @kernel
@@ -141,22 +143,20 @@ def follow_device(edge, strips, device, moved, tissue, law):
         _immerse(edge, device, tissue)
         if not edge.spans.any():
             break
-    ways = device - edge.points
+    ways, arms = device - edge.points, SHARES * (POINTS * piece)
     fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
-    if limit < 0.0:
-        _resist(edge, ways.copy(), faces, direction, piece, law, fresh, limits)
-        limit = limits.sum()
+    _resist(edge, ways.copy(), faces, direction, piece, law, fresh, limits)
+    limit, torque_limit = limits.sum(), (limits * arms).sum()
     # As it is pulled now, or will be if the device moves on.
     _resist(edge, moved.copy(), faces, direction, piece, law, fresh, limits)
-    limit = max(limit, limits.sum())
+    limit, torque_limit = max(limit, limits.sum()), max(torque_limit, (limits * arms).sum())
     force, torque = np.zeros(3), np.zeros(3)
     for i in range(POINTS):
         pull = law.stiffness * edge.spans[i] * ways[i]
-        arm = SHARES[i] * POINTS * piece * direction
         force += pull
-        torque += np.cross(arm, pull)
+        torque += np.cross(arms[i] * direction, pull)
     line, mean = _line(edge.spans, ways)
-    return Pull(force, torque, limit, line, np.sqrt((mean**2).sum()), paid, rubbed)
+    return Pull(force, torque, limit, torque_limit, line, np.sqrt((mean**2).sum()), paid, rubbed)
 
 
 @kernel

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.contact.blade import NOT_TURNED, Sweep, Turning
 from cutting_trainer.tissue_sim.mesh.strain import Strain
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
@@ -113,6 +113,7 @@ class Frame:
         force: of the tissue on the tool [N], shape (3,).
         stiffness: - d force / d position [N/m], shape (3, 3).
         resistance: largest force that the blade transmits [N].
+        turning: torque of the blade; zero outside of the tissue.
         kinetic_energy, elastic_energy: [J].
         substeps: number of substeps.
         slow_motion: simulated time over frame time, 1 unless the substeps were too few.
@@ -139,3 +140,14 @@ class Frame:
     diverged: bool = False
     trouble: str = ''
     strain: Strain | None = None
+    turning: Turning = NOT_TURNED
+
+    @property
+    def felt(self) -> tuple[float, ...]:
+        """What a tool feels: the values of a `ForceSample` from `state` on."""
+        vectors = np.concatenate([self.position, self.force, self.stiffness.ravel()])
+        scalars = (self.resistance, self.kinetic_energy, self.elastic_energy, 0)
+        torque, most, immersed = self.turning
+        return (
+            int(self.state), *vectors.tolist(), *scalars, *torque.tolist(), most, *immersed.tolist()
+        )  # fmt: skip

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance, Sweep
+from cutting_trainer.tissue_sim.contact.blade import NOT_TURNED, Blade, Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.coupling import FREE, PUSH, Coupling
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction, GrippingSprings
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutCommand, Frame, ToolContact
@@ -106,6 +106,11 @@ class TissueSimulation:
         return self.dynamics.positions
 
     @property
+    def blade(self) -> Blade | None:
+        """The blade in the tissue; None: it is outside."""
+        return self._blade
+
+    @property
     def awaits_answer(self) -> bool:
         """Whether a request to the cutting service is pending."""
         return self._outstanding is not None
@@ -166,6 +171,7 @@ class TissueSimulation:
             force=force,
             stiffness=self._stiffness.matrix(coupling, outside, self._moved, force),
             resistance=self._blade.limit if self._blade else 0.0,
+            turning=self._blade.turning if self._blade else NOT_TURNED,
             command=command,
             sweep=sweep,
         )

@@ -394,5 +394,7 @@ def _check_blade(simulation: TissueSimulation, n: int) -> None:
     within('the number of strips', strips.counts, MAX_STRIPS + 1)
     has_room('_device', blade._device, 2, 3)
     has_room('_moved', blade._moved, POINTS, 3)
-    for name in ('_tip', '_edge', '_cut_tip', '_cut_edge', 'force', 'torque'):
+    for name in ('_tip', '_edge', '_cut_tip', '_cut_edge', 'force'):
         has_room(name, getattr(blade, name), 3)
+    has_room('torque', blade.turning.torque, 3)
+    has_room('immersed', blade.turning.immersed, 2)

@@ -146,6 +146,9 @@ def force_message(
     message.resistance = frame.resistance
     message.kinetic_energy = frame.kinetic_energy
     message.elastic_energy = frame.elastic_energy
+    message.torque = frame.turning.torque
+    message.torque_resistance = frame.turning.resistance
+    message.immersed = frame.turning.immersed
     return message
 
 
