@@ -32,7 +32,7 @@ def contact_values(
     touched: Any,
     tool: tuple[np.ndarray, np.ndarray, np.ndarray],
     spring: tuple[float, float],
-    number: int = 0,
+    mode: int,
 ) -> tuple[float, ...]:
     """Return the values of a contact, in the order of `ContactCodec`.
 
@@ -43,7 +43,7 @@ def contact_values(
         touched: contact of the proxy, or the triangle it approaches; None while it is not used.
         tool: tip [m], shape (3,), force on the tissue [N], shape (3,), blade [m], shape (2, 3).
         spring: stiffness of the coupling [N/m], radius of the tool [m].
-        number: of the tool in the list of the scene.
+        mode: of the tool, one of `ToolMode`.
     """
     # Lists: for three numbers an operation of numpy takes ten times as long.
     stiffness, radius = spring
@@ -71,5 +71,6 @@ def contact_values(
         stiffness,
         *tool[2].ravel().tolist(),
         radius,
-        number,
+        0,  # the tool's number in the list of the scene
+        mode,
     )

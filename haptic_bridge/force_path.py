@@ -33,6 +33,7 @@ from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.node_common.rejections import MessageError, RejectionStatistics
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
 _SECOND = 1e-9
 _QUEUE_ALLOWANCE_NS = 3_000_000
@@ -68,6 +69,8 @@ class ForcePath:
         refusals: statistics of rejected messages: repeated, out of order, marked invalid.
         contact_time: total [s].
         max_force: largest norm commanded [N].
+        mode: of the tool, as it is reported.
+        next_mode: mode that it takes once it is outside of the tissue.
 
     Raises:
         SettingsError: the settings do not fit together.
@@ -90,6 +93,7 @@ class ForcePath:
         self.rejections = rejections or RejectionStatistics()
         self.contact_time = 0.0
         self.max_force = 0.0
+        self.mode = self.next_mode = ToolMode[tool.mode.upper()]
         self._setup = force_kernels.make_setup(tool, device, haptics, profile)
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
@@ -218,6 +222,8 @@ class ForcePath:
         self._was_enabled = enabled
         gain = self._gain(now_ns, enabled)
         touched = self._touch(now_ns, surface, enabled)
+        if self._contact != INSIDE:
+            self.mode = self.next_mode
         if fault or state is CrtkState.FAULT:
             self._s['force'] = self._s['torque'] = 0.0
         if not force_kernels.command(
@@ -241,6 +247,7 @@ class ForcePath:
             touched,
             (self._tip, self._external, self._blade),
             self._tail,
+            self.mode,
         )
         return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
 

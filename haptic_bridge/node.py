@@ -19,6 +19,7 @@ from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
 from cutting_trainer.haptic_bridge.devices.probe_graph import Wiring
 from cutting_trainer.haptic_bridge.e_stop_topic import EStop, Listener
 from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.mode_button import ModeButton
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.haptic_bridge.simulation_follower import SimulationFollower
 from cutting_trainer.haptic_bridge.warm_up import warm_up
@@ -46,6 +47,7 @@ from cutting_trainer.node_common.scene_reader import read_section
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MESH_POLL_PERIOD_S = 0.003
@@ -60,6 +62,9 @@ CLOCK_STEP_NS = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
 
+MODES = ' or '.join(mode.name.lower() for mode in ToolMode)
+
+
 class HapticBridge(ManagedNode):
     """ROS interface of `ForcePath`.
 
@@ -69,6 +74,8 @@ class HapticBridge(ManagedNode):
             Never again after that: a FAULT is left by a command only. Never after an E-STOP.
         e_stop_pressed: E-STOP is pressed from the start, as it was when this node died.
         force_scale: hand force over tissue force; may be set while the node runs.
+        tool_mode: scalpel or palpator; may be set while the node runs. A blade in the tissue stays
+            one until it is out.
         accepted_publishers: see `accepted_publishers`.
     """
 
@@ -126,6 +133,12 @@ class HapticBridge(ManagedNode):
         self._wiring, self._wiring_due = Wiring(self, self._wrench, understood), 0.0
         text = 'hand force over tissue force [-], above 0 to 100'
         parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
+        text = f'what the tool is: {MODES}; used once it is outside of the tissue'
+        mode = parameter(self, 'tool_mode', tool.mode, text, settable=True)
+        self._path.next_mode = mode_of(mode)
+        self._mode_button = None
+        if device.mode_button is not None:
+            self._mode_button = ModeButton(self, device.mode_button, self._change_mode)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
         self._epoch = time.time_ns() - time.monotonic_ns()
@@ -196,11 +209,14 @@ class HapticBridge(ManagedNode):
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Reject a request with any invalid parameter: all of it is used, or nothing."""
         for given in parameters:
-            if given.name != 'force_scale':
+            if given.name not in ('force_scale', 'tool_mode'):
                 reason = f'{given.name} is read only at the start of the node'
                 return SetParametersResult(successful=False, reason=reason)
             try:
-                self._path.check_scale(given.value)
+                if given.name == 'tool_mode':
+                    mode_of(given.value)
+                else:
+                    self._path.check_scale(given.value)
             except ValueError as error:
                 reason = ' '.join(str(error).split())
                 return SetParametersResult(successful=False, reason=reason)
@@ -210,6 +226,13 @@ class HapticBridge(ManagedNode):
         for given in parameters:
             if given.name == 'force_scale':
                 self._path.scale_force(given.value)
+            elif given.name == 'tool_mode':
+                self._path.next_mode = mode_of(given.value)
+
+    def _change_mode(self) -> None:
+        """Make a palpator of the scalpel, and back."""
+        mode = ToolMode(1 - self._path.next_mode).name.lower()
+        self.set_parameters([Parameter('tool_mode', value=mode)])
 
     def _cause(self) -> str:
         now = time.monotonic_ns()
@@ -311,6 +334,7 @@ class HapticBridge(ManagedNode):
             'faults': self._faults,
             'last_fault': self._last_fault,
             'contact': path.contact,
+            'tool_mode': path.mode.name.lower(),
             'contact_time': path.contact_time,
             'force_norm': path.force_norm,
             'max_force': path.max_force,
@@ -345,6 +369,18 @@ def accepted_publishers(node: ManagedNode, device: DeviceSettings) -> frozenset[
     text = 'nodes, as /name, separated by commas: as device.accepted_publishers of the scene'
     given = str(parameter(node, 'accepted_publishers', '', text))
     return frozenset((*device.accepted_publishers, *filter(None, given.split(','))))
+
+
+def mode_of(name: object) -> ToolMode:
+    """Return the mode of a name.
+
+    Raises:
+        ValueError: there is none of this name.
+    """
+    known = {mode.name.lower(): mode for mode in ToolMode}
+    if name not in known:
+        raise ValueError(f'tool_mode is {name!r:.40}: it must be {MODES}')
+    return known[str(name)]
 
 
 def of_tissue(scene: Path) -> tuple[float, Friction]:

@@ -37,6 +37,12 @@ class ToolSettings(SceneModel):
         (0.0, 0.0, -0.004), description='[m] end of the cutting edge at the tip, tool frame'
     )
 
+    mode: Literal['scalpel', 'palpator'] = Field(
+        'scalpel',
+        description='what the tool is at first; a palpator never goes in. The parameter '
+        '`tool_mode` of haptic_bridge, or `device.mode_button`, changes it',
+    )
+
     @model_validator(mode='after')
     def _blade_has_length(self) -> 'ToolSettings':
         if np.linalg.norm(np.subtract(self.blade_root, self.blade_tip)) < 1e-4:
@@ -94,6 +100,13 @@ class DeviceSettings(SceneModel):
     )
     e_stop_button: int | None = Field(
         None, ge=0, le=31, description='index into buttons of arm/button that presses E-STOP'
+    )
+    mode_button: int | None = Field(
+        None,
+        ge=0,
+        le=31,
+        description='index into buttons of arm/button that makes a palpator of the scalpel, or '
+        'back',
     )
     accepted_publishers: tuple[str, ...] = Field(
         (),

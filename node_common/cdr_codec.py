@@ -26,7 +26,8 @@ _FRAME_CACHE_SIZE = 64
 """Decoded frame_ids that are kept."""
 NORM_TOLERANCE = 0.01
 """Largest difference between the norm of a unit quaternion and 1."""
-_LAST_STATE = 2
+_LAST = {'state': 2, 'mode': 1}
+"""Largest number of a field that chooses."""
 MAX_QUANTITY = 1e6
 """Bound on every physical quantity: a position in millimetres, a stiffness in N/m."""
 
@@ -166,8 +167,8 @@ class StampedCodec:
             if name == 'orientation' and abs(math.hypot(*values[at]) - 1) > NORM_TOLERANCE:
                 text = f'its length is {math.hypot(*values[at]):.3g}, it must be 1'
                 raise MessageError('orientation that is no unit quaternion', text)
-            if name == 'state' and values[at][0] > _LAST_STATE:
-                raise MessageError('no such state', f'state {values[at][0]} of {self.name}')
+            if name in _LAST and values[at][0] > _LAST[name]:
+                raise MessageError(f'no such {name}', f'{name} {values[at][0]} of {self.name}')
             if name == 'tool':
                 require_tool(self.name, values[at][0])
         return sample
@@ -236,8 +237,9 @@ class ContactCodec(StampedCodec):
         ('blade_tip', 'd', 3),
         ('proxy_radius', 'd', 1),
         ('tool', 'B', 1),
+        ('mode', 'B', 1),
     )
-    older = (15,)
+    older = (15, 16)
 
 
 class ForceSampleCodec(StampedCodec):

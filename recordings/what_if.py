@@ -36,7 +36,7 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.in_process import make_force_path
 from cutting_trainer.session.scene_loader import Scene
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
-from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact
+from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact, ToolMode
 
 _FRAME_NS, _TICK_NS = 33_333_333, 1_000_000
 _NANOSECOND_S = 1e-9
@@ -130,6 +130,7 @@ class Hand:
         state: operating state.
         surface, sample: newest surface and force sample; the next tick takes the sample.
         contact: contact of the last tick, None before the first.
+        mode: recorded of the tool last; None before the first contact.
         ticks: time [ns], norm of the force [N] and contact flag of each tick.
     """
 
@@ -138,7 +139,16 @@ class Hand:
     surface: Surface | None = None
     sample: StampedMessage | None = None
     contact: StampedMessage | None = None
+    mode: int | None = None
     ticks: list[tuple[int, float, bool]] = field(default_factory=list)
+
+    def follow(self, record: FrameRecord) -> int:
+        """Change the tool as it was changed before a frame; return `time_of_contact`."""
+        if record.contact is not None:
+            if self.mode is not None and record.contact.mode != self.mode:
+                self.path.next_mode = ToolMode(record.contact.mode)
+            self.mode = record.contact.mode
+        return time_of_contact(record)
 
     def tick(self, pose: StampedMessage) -> None:
         now = pose.stamp_ns
@@ -164,8 +174,8 @@ def run_experiment(bag: Bag, scene: Scene, computed: Resimulation) -> Run:
         SessionError: the bag has no poses, or the changed session ends in a FAULT.
     """
     records, poses = computable_poses(bag)
-    untils = [time_of_contact(record) for record in records]
     hand = Hand(make_force_path(scene))
+    untils = (hand.follow(record) for record in records)
     computed.answer_frames = answer_frames(records)
     for _ in closed_loop(poses, untils, hand, computed):
         pass

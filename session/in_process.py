@@ -21,7 +21,13 @@ from cutting_trainer.node_common.cdr_codec import ContactCodec, StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
-from cutting_trainer.tissue_sim.contact.tool import ContactState, CutOutcome, Frame, ToolContact
+from cutting_trainer.tissue_sim.contact.tool import (
+    ContactState,
+    CutOutcome,
+    Frame,
+    ToolContact,
+    ToolMode,
+)
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
 from cutting_trainer.tissue_sim.simulation.cut_transaction import CutTransaction
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
@@ -145,6 +151,7 @@ def tool_contact(values: Sequence[float]) -> ToolContact:
         blade_tip=get('blade_tip'),
         sequence=int(get('sequence')[0]),
         external=get('external_force'),
+        mode=ToolMode(int(get('mode')[0])),
     )
 
 

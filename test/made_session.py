@@ -1,5 +1,6 @@
 """The bag of a session that this machine has just computed, with the sample's hand: no graph."""
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation
 from cutting_trainer.recordings.what_if import Hand, closed_loop
 from cutting_trainer.session.scene_loader import Scene, load_scene
-from cutting_trainer.tissue_sim.contact.tool import Frame
+from cutting_trainer.tissue_sim.contact.tool import Frame, ToolMode
 from cutting_trainer.tissue_sim.simulation.cut_transaction import ANSWER_FRAMES
 from cutting_trainer.tissue_sim.simulation.serialisation import ObjectState
 from cutting_trainer.tissue_sim.simulation.state import state_of
@@ -70,7 +71,13 @@ def watched(scene: Scene, every: int) -> Watched:
     return computed
 
 
-def make_session(sample: Path, folder: Path, temporary: Path, every: int = 0) -> Path:
+def make_session(
+    sample: Path,
+    folder: Path,
+    temporary: Path,
+    every: int = 0,
+    modes: Mapping[int, ToolMode] | None = None,
+) -> Path:
     """Writes the bag of a session: the hand of a sample, everything else computed now.
 
     Args:
@@ -78,6 +85,7 @@ def make_session(sample: Path, folder: Path, temporary: Path, every: int = 0) ->
         folder: of the new bag.
         temporary: for the scene.
         every: frames from one whole state in the bag to the next; 0: it has none.
+        modes: that the tool takes at the beginning of some frames.
     """
     bag = open_bag(sample)
     scene = load_scene(str(restore_scene(bag, temporary)))
@@ -116,8 +124,14 @@ def make_session(sample: Path, folder: Path, temporary: Path, every: int = 0) ->
     keyframe(start)
     cut_step = 0
     untils = range(start + PERIOD, end, PERIOD)
+
+    def begins() -> Iterator[int]:
+        for number, until in enumerate(untils):
+            hand.path.next_mode = (modes or {}).get(number, hand.path.next_mode)
+            yield until
+
     for until, (frame, answer) in zip(
-        untils, closed_loop(poses, untils, hand, computed), strict=True
+        untils, closed_loop(poses, begins(), hand, computed), strict=True
     ):
         assert hand.contact is not None
         contact, time = hand.contact, until + 1

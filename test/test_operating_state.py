@@ -12,7 +12,9 @@ import rclpy
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import Joy
 
+from cutting_trainer.haptic_bridge.mode_button import ModeButton
 from cutting_trainer.haptic_bridge.node import HapticBridge
 from cutting_trainer.node_common.crtk import REPLY_PERIOD_S
 from cutting_trainer.node_common.lifecycle import Stop
@@ -26,6 +28,7 @@ from cutting_trainer.node_common.operating_state import (
 )
 from cutting_trainer.node_common.rejections import MessageError
 from cutting_trainer.session.domain import reserved_domain
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
 D, E, P, F = CrtkState.DISABLED, CrtkState.ENABLED, CrtkState.PAUSED, CrtkState.FAULT
 INVALID = True
@@ -317,3 +320,17 @@ def test_of_a_request_that_is_refused_nothing_is_used(bridge: HapticBridge):
     assert bridge._path.haptics.force_scale == 1.0
     assert bridge.set_parameters_atomically(request[:1]).successful
     assert bridge._path.haptics.force_scale == 1.5
+
+
+def test_the_mode_of_the_tool_is_a_parameter_and_a_button_changes_it(bridge: HapticBridge):
+    refused = bridge.set_parameters([Parameter('tool_mode', value='saw')])[0]
+    assert not refused.successful and 'scalpel or palpator' in refused.reason
+    bridge.set_parameters([Parameter('tool_mode', value='palpator')])
+    assert bridge._path.next_mode == ToolMode.PALPATOR
+    button = ModeButton(bridge, 1, bridge._change_mode)
+    for pressed in ([0, 0], [0, 1], [0, 1], [0, 0]):
+        button._event(Joy(buttons=pressed))
+    assert bridge._path.next_mode == ToolMode.SCALPEL
+    assert bridge.get_parameter('tool_mode').value == 'scalpel'
+    with pytest.raises(MessageError, match='no such button'):
+        button._event(Joy(buttons=[0]))

@@ -53,6 +53,7 @@ def contact(**changed: Any) -> SimpleNamespace:
         'coupling_stiffness': 200.0,
         'proxy_radius': 0.004,
         'tool': 0,
+        'mode': 0,
     }
     for name in ('device', 'proxy', 'point', 'blade_root', 'blade_tip', 'external_force'):
         fields[name] = np.zeros(3)
@@ -109,6 +110,7 @@ def test_a_contact_of_before_a_cut_that_took_nodes_away_is_none_of_its_nodes() -
     [
         ({'state': 3}, 'no such state'),
         ({'tool': 1}, 'no such tool'),
+        ({'mode': 2}, 'no such mode of the tool'),
         ({'nodes': np.full(9, 2**32 - 1, np.uint32)}, 'index out of range'),
         ({'weights': np.full(9, 0.5)}, 'invalid weights'),
         ({'normal': np.array([0.0, 0.0, 1.1])}, 'invalid normal'),
@@ -217,6 +219,13 @@ def test_an_orientation_or_a_state_that_does_not_exist_is_not_believed() -> None
         values[codec.fields['tool'].start] = 1
         with pytest.raises(MessageError, match=r'tool 1 of .*: the scene has 1, and the first is'):
             codec().believed(codec().encode(5, values))
+
+
+def test_a_mode_of_the_tool_that_does_not_exist_is_not_believed() -> None:
+    values = [0] * ContactCodec.fields['mode'].stop
+    values[-1] = 2
+    with pytest.raises(MessageError, match='no such mode'):
+        ContactCodec().believed(ContactCodec().encode(5, values))
 
 
 def test_a_surface_that_is_not_that_of_its_tetrahedra_makes_no_mesh() -> None:

@@ -102,6 +102,7 @@ def test_fields_are_named_as_in_the_message(codec):
     ('codec', 'older'),
     [
         (ContactCodec, 'tool'),
+        (ContactCodec, 'mode'),
         (ForceSampleCodec, 'tool'),
         (ForceSampleCodec, 'torque'),
     ],

@@ -5,7 +5,12 @@ from typing import Any
 import numpy as np
 
 from cutting_trainer.node_common.rejections import MessageError, require_frame, require_tool
-from cutting_trainer.tissue_sim.contact.tool import MIN_RADIUS_M, ContactState, ToolContact
+from cutting_trainer.tissue_sim.contact.tool import (
+    MIN_RADIUS_M,
+    ContactState,
+    ToolContact,
+    ToolMode,
+)
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 _VECTORS = ('weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip')
@@ -33,6 +38,9 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
     require_tool('Contact', message.tool)
     if message.state > ContactState.INSIDE:
         raise MessageError('no such state', f'state {message.state} is none of 0, 1, 2')
+    if message.mode not in list(ToolMode):
+        text = f'mode {message.mode} is none of {", ".join(f"{m}" for m in ToolMode)}'
+        raise MessageError('no such mode of the tool', text)
     for name in _VECTORS:
         values = getattr(message, name)
         if not (np.abs(values) <= _MAX_COORDINATE).all():  # a NaN is not
@@ -83,6 +91,7 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
         blade_tip=message.blade_tip,
         sequence=message.sequence,
         external=message.external_force,
+        mode=ToolMode(message.mode),
     )
 
 

@@ -21,6 +21,13 @@ class ContactState(enum.IntEnum):
     INSIDE = 2
 
 
+class ToolMode(enum.IntEnum):
+    """What a tool is; numbers as in `Contact`. A palpator never goes in."""
+
+    SCALPEL = 0
+    PALPATOR = 1
+
+
 class CutCommand(enum.IntEnum):
     """Command to the cutting service; numbers as in `Cut`."""
 
@@ -53,6 +60,7 @@ class ToolContact:
         offset: from the touched point to the proxy's centre [m], shape (3,).
         external: force of the tool on the tissue as the bridge has it [N], shape (3,); the
             simulation takes from it whether the tool slides.
+        mode: what the tool is. A blade that is in the tissue stays there.
     """
 
     state: ContactState
@@ -68,6 +76,7 @@ class ToolContact:
     blade_tip: np.ndarray
     sequence: int = 0
     external: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    mode: ToolMode = ToolMode.SCALPEL
 
 
 def indenter_contact(

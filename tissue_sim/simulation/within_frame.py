@@ -8,7 +8,7 @@ import numpy as np
 
 from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
-from cutting_trainer.tissue_sim.contact.tool import ToolContact
+from cutting_trainer.tissue_sim.contact.tool import ToolContact, ToolMode
 from cutting_trainer.tissue_sim.mesh.locate import NearElements
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
@@ -86,7 +86,7 @@ class ToolInFrame:
     def _punctures(self, share: float, positions: np.ndarray) -> bool:
         """Return whether the tool presses harder on the surface than it bears."""
         spring = self._pushing
-        if spring.mode != PUSH:
+        if spring.mode != PUSH or self._contact.mode == ToolMode.PALPATOR:
             return False
         pressed = float(np.linalg.norm(spring.force(positions, share)))
         return pressed >= self._resistance.threshold

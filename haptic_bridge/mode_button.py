@@ -1,0 +1,36 @@
+"""A button of the device that makes a palpator of the scalpel, and back."""
+
+from collections.abc import Callable
+
+from sensor_msgs.msg import Joy
+
+from cutting_trainer.node_common import qos, ros
+from cutting_trainer.node_common.lifecycle import ManagedNode
+from cutting_trainer.node_common.rejections import MessageError
+
+
+class ModeButton:
+    """Calls a function each time that a button is pressed.
+
+    Args:
+        node: to subscribe with.
+        button: index into `buttons` of `arm/button`.
+        press: called when it goes down.
+    """
+
+    def __init__(self, node: ManagedNode, button: int, press: Callable[[], None]) -> None:
+        self._button, self._press = button, press
+        self._is_held = False
+        self._presses = ros.listen(node, Joy, f'{ros.ARM}/button', self._event, qos.EVENTS)
+
+    def _event(self, message: Joy) -> None:
+        """Follow the button.
+
+        Raises:
+            MessageError: the message has no such button.
+        """
+        if not (self._button < len(message.buttons) and message.buttons[self._button] in (0, 1)):
+            raise MessageError('no such button', f'buttons[{self._button}] has to be 0 or 1')
+        was_held, self._is_held = self._is_held, message.buttons[self._button] == 1
+        if self._is_held and not was_held:
+            self._press()

@@ -1,0 +1,72 @@
+"""Scalpel and palpator: by the scene, while the session runs, and computed again as it was."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_session import make_session
+from rig import QUIET, RADIUS, Rig
+
+from cutting_trainer import simulate
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.resimulation import as_recorded
+from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
+from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate_command import recomputation
+from cutting_trainer.recordings.what_if import computable_poses, run_experiment
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
+
+SAMPLE = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_4' / 'straight_cut'
+MODE = ContactCodec.fields['mode'].start
+PALPATOR, SCALPEL = ToolMode.PALPATOR, ToolMode.SCALPEL
+
+
+def test_a_palpator_that_presses_as_hard_as_a_scalpel_never_goes_in() -> None:
+    session = simulate('block')
+    session.path.next_mode = PALPATOR
+    path = np.linspace(-0.010, -0.022, 600)
+    pressed = [session.tick(np.array([-0.012, -0.008, z])).wrench[2] for z in path]
+    assert max(pressed) > 0.03  # threshold of the block [N]
+    assert session.tissue.simulation.elements_cut == 0
+    session.path.next_mode = SCALPEL
+    for _ in range(100):
+        session.tick(np.array([-0.012, -0.008, path[-1]]))
+    assert session.tissue.simulation.blade is not None
+
+
+def test_the_mode_is_that_of_the_scene_and_changes_outside_of_the_tissue_only() -> None:
+    rig = Rig(haptics=QUIET, tool=ToolSettings(radius=RADIUS, mode='palpator'))
+    rig.run(np.linspace(0.005, 0.001, 60))
+    assert rig.ticks[-1].contact[MODE] == PALPATOR
+    rig.path.next_mode = SCALPEL
+    rig.run(0.001)
+    assert rig.ticks[-1].contact[MODE] == SCALPEL
+    rig.inside = True
+    rig.run(np.full(70, 0.001))
+    rig.path.next_mode = PALPATOR
+    rig.run(np.full(70, 0.001))
+    assert rig.ticks[-1].contact[MODE] == rig.path.mode == SCALPEL
+    rig.inside = False
+    rig.run(np.full(70, 0.02))
+    assert rig.ticks[-1].contact[MODE] == rig.path.mode == PALPATOR
+
+
+@pytest.mark.long
+def test_a_session_in_which_the_mode_changes_is_computed_again_as_it_was(tmp_path: Path) -> None:
+    for folder in ('scene', 'again'):
+        (tmp_path / folder).mkdir()
+    made = make_session(SAMPLE, tmp_path / 'bag', tmp_path / 'scene', modes={2: PALPATOR})
+    bag = open_bag(made)
+    scene = load_scene(str(restore_scene(bag, tmp_path / 'again')))
+    assert scene.tool.mode == 'scalpel'
+    records, _ = computable_poses(bag)
+    assert {record.contact.mode for record in records if record.contact} == {SCALPEL, PALPATOR}
+    computed, place = recomputation(scene), ForceSampleCodec.fields['force']
+    for record, frame in zip(records, as_recorded(records, computed), strict=True):
+        assert record.force is not None
+        np.testing.assert_array_equal(frame.force, record.force.values[place])
+    assert computed.simulation.elements_cut == 0
+    # From the hand alone, too.
+    assert run_experiment(bag, scene, recomputation(scene)).elements_cut == 0
