@@ -355,7 +355,7 @@ class Dynamics:
             steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
             if self._stiffened is not None:
                 if done >= adapt:
-                    operands = self._far.operands() if self._far else self.model.operands()
+                    operands = region.operands if self._far else self.model.operands()
                     begun = done == 0 and self._far is None
                     given = self._u[:size], moving, self.inverse_mass, operands
                     self._stiffened.adapt(*given, begun=begun)
