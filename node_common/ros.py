@@ -38,7 +38,8 @@ HAND = f'{ARM}/hand/servo_cp'
 E_STOP = 'haptic_bridge/e_stop'
 DIAGNOSTICS = '/diagnostics'
 MARKERS = 'viewer/markers'
-STATIC_FRAMES = '/tf_static'
+STATIC_FRAMES = 'tf_static'
+"""In the namespace, as all but the diagnostics: two trainers in one domain have frames of their own."""
 
 
 DIAGNOSTICS_TIMEOUT_S = 1.5

@@ -110,6 +110,8 @@ SHOWN = {
     'view --attach': 'viewer is ready',
 }
 """Run here, with a port that is free, until they say this; then ended by Ctrl-C."""
+SERVED_ALIKE = ('view --bag BAG', 'view --bag BAG --resimulate')
+"""Of these, by the same code as with `--with`, which computes the most."""
 DRIVES = Elsewhere(
     'test_integrate.py::test_example_that_drives_the_tool_presses_and_follows_the_mesh',
     ('../session/node_commands.py',),
@@ -344,7 +346,10 @@ def environment(domain: int) -> dict[str, str]:
     return node_environment(domain) | {'PYTHONUNBUFFERED': '1', 'COLUMNS': '200'}
 
 
-@pytest.mark.parametrize('command', SHOWN)
+@pytest.mark.parametrize(
+    'command',
+    [pytest.param(c, marks=pytest.mark.thorough if c in SERVED_ALIKE else ()) for c in SHOWN],
+)
 def test_page_is_served_until_ctrl_c(command: str, checkout: Path) -> None:
     with reserved_domain('free') as domain:
         pass

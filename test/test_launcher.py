@@ -564,6 +564,15 @@ def runs(stat: Path) -> bool:
         return False
 
 
+def test_processes_keep_bytecode_in_the_environment_whatever_the_shell_says(launcher: Any) -> None:
+    home = launcher.find_home({})
+    environ = launcher.node_environment(home, dict(os.environ, PYTHONDONTWRITEBYTECODE='1'))
+    asked = 'import sys; print(sys.dont_write_bytecode, sys.pycache_prefix)'
+    command = [sys.executable, '-c', asked]
+    said = subprocess.run(command, env=environ, capture_output=True, text=True, check=True).stdout
+    assert said.split() == ['False', str(home.folder / 'bytecode')]
+
+
 def test_clean_leaves_nothing_but_the_lock(tree: Path) -> None:
     (tree / '.trainer' / 'wheels' / 'env').mkdir(parents=True)
     assert start(tree, 'clean').returncode == 0

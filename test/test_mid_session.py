@@ -46,8 +46,8 @@ VISCOUS = {
     'tissue.material.prony': '[[0.3, 0.05], [0.2, 1.0]]',
     'tissue.gravity': '[0.0, 0.0, -9.81]',
 }
-ALIKE = 200
-"""Frames for which original and restored one are compared."""
+ALIKE = 60
+"""Frames, two seconds, for which original and restored one are compared."""
 
 
 @dataclass

@@ -19,12 +19,14 @@ def run(code: str) -> str:
     ).stdout
 
 
+@pytest.mark.long
 def test_a_scene_gives_a_force_against_the_press_and_a_cut() -> None:
     said = run(EXAMPLES[0])
     assert float(said.splitlines()[0].split()[-1]) > 0.01
     assert int(said.split()[-1]) > 0
 
 
+@pytest.mark.long
 def test_a_mesh_and_a_material_give_a_force_against_the_press() -> None:
     said = run(EXAMPLES[1])
     assert float(re.search(r'\[ *\S+ +\S+ +(\S+)\] substeps', said)[1]) > 0.01

@@ -317,7 +317,9 @@ def test_the_same_hand_on_the_same_tissue_gives_the_same_and_on_a_tougher_one_mo
     assert first.peak == pytest.approx(max(live), rel=0.3)
 
 
-@pytest.mark.parametrize('name', ['straight_cut', 'crossing_cuts'])
+@pytest.mark.parametrize(
+    'name', ['straight_cut', pytest.param('crossing_cuts', marks=pytest.mark.thorough)]
+)
 def test_beside_a_changed_session_stands_the_recorded_one(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,6 +17,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from cutting_trainer.haptic_bridge.force_kernels import TOUCHING
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings, Vector
+from cutting_trainer.node_common import ros
 from cutting_trainer.node_common.qos import LATCHED
 from cutting_trainer.node_common.ros import STATIC_FRAMES
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
@@ -203,6 +204,12 @@ def test_static_frames_are_those_of_the_drivers_poses_and_of_the_scene_that_runs
     both = ('MTML_base', 'arm_base')
     assert said[0] == [('tissue', 'arm_base', 0.0)]
     assert said[1:] == [[('tissue', name, x) for name in both] for x in (0.0, 0.1)]
+
+
+def test_two_trainers_in_one_domain_share_no_topic_but_the_diagnostics():
+    topics = {v for k, v in vars(ros).items() if k.isupper() and isinstance(v, str)}
+    assert STATIC_FRAMES in topics
+    assert {topic for topic in topics if topic.startswith('/')} == {'/diagnostics'}
 
 
 def test_frames_that_another_node_owns_get_no_second_parent(monkeypatch):

@@ -97,7 +97,7 @@ class ViewerNode(ManagedNode):
         self._reactions = StreamRate()
         self._samples = ros.polled(self, ForceSample, ros.FORCE, qos.NEWEST_BEST_EFFORT)
         self._marker_array = self.create_publisher(MarkerArray, ros.MARKERS, qos.EVENTS)
-        text = 'publish the frames of the device on /tf_static; false: another node owns them'
+        text = 'publish the frames of the device on tf_static; false: another node owns them'
         publish = bool(parameter(self, 'publish_frames', True, text))
         self._frames = StaticFrames(self, self._device, publish=publish)
         self._statuses = Statuses(self.get_namespace())

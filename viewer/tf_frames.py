@@ -46,7 +46,7 @@ def publishing_command(frame: TransformStamped) -> str:
 
 
 class StaticFrames:
-    """Publishes /tf_static where its type is installed; else logs the command that would.
+    """Publishes tf_static where its type is installed; else logs the command that would.
 
     Args:
         node: publisher and logger.
@@ -62,7 +62,7 @@ class StaticFrames:
             return
         if TFMessage is None:
             command = publishing_command(device_frame(device))
-            node.get_logger().info(f'/tf_static needs tf2_msgs; instead: {command}')
+            node.get_logger().info(f'tf_static needs tf2_msgs; instead: {command}')
         else:
             self._publisher = node.create_publisher(TFMessage, STATIC_FRAMES, LATCHED)
         self._publish()
