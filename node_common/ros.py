@@ -39,7 +39,7 @@ E_STOP = 'haptic_bridge/e_stop'
 DIAGNOSTICS = '/diagnostics'
 MARKERS = 'viewer/markers'
 STATIC_FRAMES = 'tf_static'
-"""In the namespace, as all but the diagnostics: two trainers in one domain have frames of their own."""
+"""In the namespace, as all but the diagnostics: two trainers in one domain share no frame."""
 
 
 DIAGNOSTICS_TIMEOUT_S = 1.5
