@@ -122,7 +122,7 @@ def local_blade(
     out: np.ndarray,
     torque: np.ndarray,
 ) -> None:
-    """Extrapolate by a stiffness that is spread evenly over what of the blade is in the tissue.
+    """Extrapolate by a stiffness spread evenly over the part of the blade in the tissue.
 
     A place s of the blade (0 at its tip, 1 at its root) has moved by d(s) = d_0 + s (d_1 - d_0).
     With the means over the places in the tissue, the force is F = F_i - K mean(d), its first moment

@@ -83,7 +83,7 @@ def make_plan(
     Args:
         task: the scene.
         note: gets one sentence if the plan is made anew.
-        say: gets what is measured next.
+        say: gets the name of the next measurement.
     """
     known = recall(task, note)
     if known is not None:
@@ -106,7 +106,7 @@ def make_simulation(
     Args:
         settings: its section `tissue`.
         before: state of the tissue in an earlier simulation of this scene, to continue from.
-        note: gets one sentence if a plan is made anew, and what is measured for it.
+        note: gets one sentence if a plan is made anew, and the name of each measurement.
 
     Raises:
         MeshError: the mesh is not valid, or has no shape at rest under its weight.

@@ -1,4 +1,4 @@
-"""Figures of the blade's law: what a cut costs the hand."""
+"""Figures of the law of the blade: work of the hand by a cut."""
 
 from bench.figures.figure import Figure
 from bench.haptics.turned_blade import PRICE, turned

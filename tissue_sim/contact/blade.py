@@ -70,7 +70,7 @@ class Resistance:
 
 
 class Turning(NamedTuple):
-    """What a tool feels of being turned.
+    """Resistance of the tissue to turning a tool.
 
     Attributes:
         torque: of the tissue on the tool about the tip of its blade [N m], shape (3,).

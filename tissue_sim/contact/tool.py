@@ -22,7 +22,7 @@ class ContactState(enum.IntEnum):
 
 
 class ToolMode(enum.IntEnum):
-    """What a tool is; numbers as in `Contact`. A palpator never goes in."""
+    """Kind of a tool; numbers as in `Contact`. A palpator never goes in."""
 
     SCALPEL = 0
     PALPATOR = 1
@@ -60,7 +60,7 @@ class ToolContact:
         offset: from the touched point to the proxy's centre [m], shape (3,).
         external: force of the tool on the tissue as the bridge has it [N], shape (3,); the
             simulation takes from it whether the tool slides.
-        mode: what the tool is. A blade that is in the tissue stays there.
+        mode: kind of the tool. A blade that is in the tissue stays there.
     """
 
     state: ContactState

@@ -38,7 +38,7 @@ def far_field(
         candidate: the method with all nodes moving.
         indenter: at the softest place.
         depth: of the tool in the measured frames [m].
-        say: gets what is measured next.
+        say: gets the name of the next measurement.
     """
     smoothed = candidate.model not in ('linear', 'corotational')
     trial = FarFieldTrial(task.mesh, task.material, indenter, smoothed=smoothed)

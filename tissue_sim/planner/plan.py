@@ -91,7 +91,7 @@ def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
 
     Args:
         task: the scene.
-        say: gets what is measured next.
+        say: gets the name of the next measurement.
 
     Raises:
         MeshError: the mesh cannot be probed.
