@@ -11,11 +11,10 @@ from cutting_trainer.session.errors import SessionError
 
 Tier = Literal['quick', 'usual', 'all']
 """Which tests are run; test/conftest.py says what each leaves out."""
-TESTS, LIVE, ALONE = 'tests', 'live tests two at a time', 'tests one at a time'
-PARTS = {TESTS: 'beside', LIVE: 'live', ALONE: 'alone'}
-MAX_REPETITIONS = 3
-"""Further runs, one at a time, of live and lone tests that failed. They measure the clock, and a
-shared machine may stand still for seconds; each says what it measured."""
+TESTS, ALONE = 'tests', 'tests one at a time'
+MAX_REPETITIONS_ALONE = 3
+"""Further runs of those tests one at a time that failed. They measure the clock, and a shared
+machine may stand still for seconds; each says what it measured."""
 TESTS_FAILED, NO_TESTS = 1, 5
 """Exit statuses of pytest: some test failed; there was none."""
 
@@ -55,9 +54,9 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
     of mypy stand in pyproject.toml.
 
     Args:
-        pytest_arguments: for all parts of the tests: those that may run beside others, on every
-            processor; live ones, two at a time; those that want the machine for themselves.
-        temporary: folder for the files of all: the last tests look at what all have made.
+        pytest_arguments: for both parts of the tests: those that may run beside others, on every
+            processor, and those that want the machine for themselves.
+        temporary: folder for the files of both: the last tests look at what all have made.
         tier: the quick one has only tests of the first part, and leaves out the types.
     """
     python = (sys.executable, '-m')
@@ -66,18 +65,15 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
         Check('ruff format', (*python, 'ruff', 'format', '--check', '.')),
         Check('mypy', (*python, 'mypy')),
     ]
-    for name, workers, repetitions in (
-        (TESTS, ('--numprocesses=auto', '--dist=loadfile'), 0),
-        (LIVE, ('--numprocesses=2', '--dist=loadfile'), MAX_REPETITIONS),
-        (ALONE, (), MAX_REPETITIONS),
+    for name, part, more, repetitions in (
+        (TESTS, 'beside', ('--numprocesses=auto', '--dist=loadfile'), 0),
+        (ALONE, 'alone', (), MAX_REPETITIONS_ALONE),
     ):
-        part = PARTS[name]
         which = (f'--tier={tier}', f'--part={part}', '--last-failed-no-failures=none')
         where = (f'--basetemp={temporary / part}', '-o', f'cache_dir=.pytest_cache/{part}')
-        argv = (*python, 'pytest', *which, *where, *workers, *pytest_arguments)
+        argv = (*python, 'pytest', *which, *where, *more, *pytest_arguments)
         checks.append(Check(name, argv, repetitions))
-    left_out = ('mypy', LIVE, ALONE) if tier == 'quick' else ()
-    return [check for check in checks if check.name not in left_out]
+    return [check for check in checks if tier != 'quick' or check.name not in ('mypy', ALONE)]
 
 
 def run_checks(
@@ -111,11 +107,8 @@ def run_checks(
 
 
 def again(check: Check, number: int) -> list[str]:
-    """Return the command of a check for the tests that failed, one at a time, with a folder of its
-    own.
-    """
+    """Return the command of a check for the tests that failed, with a folder of its own."""
     argv = [f'{a}-{number}' if a.startswith('--basetemp=') else a for a in check.argv]
-    argv = [a for a in argv if not a.startswith(('--numprocesses=', '--dist='))]
     return [*argv, '--last-failed']
 
 
@@ -125,7 +118,7 @@ def verdict(results: dict[str, int]) -> tuple[int, str]:
 
     Arguments may choose tests of one part only; of none is a failure.
     """
-    parts = [name for name in PARTS if name in results]
+    parts = [name for name in (TESTS, ALONE) if name in results]
     empty = [name for name in parts if results[name] == NO_TESTS]
     if len(empty) < len(parts):
         results = {name: status for name, status in results.items() if name not in empty}

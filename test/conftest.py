@@ -25,13 +25,8 @@ settings.register_profile('quick', deadline=None, max_examples=10)
 STAND_INS = Path(__file__).with_name('stand_ins')
 PYTHON = f'python{sys.version_info.major}.{sys.version_info.minor}'
 BUILT = pytest.StashKey[Path]()
-PARTS = {'live': 'real_time', 'alone': 'alone'}
-"""Marks of the tests of a part; all others run beside one another."""
-LEFT_OUT = {
-    'quick': {'long', 'thorough', *PARTS.values()},
-    'usual': {'thorough'},
-    'all': set[str](),
-}
+ALONE = {'alone', 'real_time'}
+LEFT_OUT = {'quick': {'long', 'thorough', *ALONE}, 'usual': {'thorough'}, 'all': set[str]()}
 """Marks of the tests that a tier leaves out."""
 MODULE_MARKS = re.compile(r'^pytestmark = (\[[^\]]*\]|.*)', re.MULTILINE)
 RUN = 'TRAINER_TEST_RUN'
@@ -39,12 +34,12 @@ RUN = 'TRAINER_TEST_RUN'
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add `--part` and `--tier`: `trainer test` runs the parts of a tier, one after the other."""
+    """Add `--part` and `--tier`: `trainer test` runs both parts of a tier, one after the other."""
     parser.addoption(
         '--part',
-        choices=('beside', *PARTS),
-        help='only tests that may run beside any others, or only live ones, which measure the '
-        'clock, or only those that want the machine for themselves',
+        choices=('beside', 'alone'),
+        help='only tests that may run beside others, or only those that must not: '
+        'they measure the clock, or what a processor does',
     )
     parser.addoption(
         '--tier',
@@ -74,18 +69,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if collection_path.suffix != '.py' or not collection_path.is_file():
         return None
     text, part = collection_path.read_text(encoding='utf-8'), config.getoption('part')
-    if part in PARTS and f'mark.{PARTS[part]}' not in text:
+    if part == 'alone' and not any(f'mark.{name}' in text for name in ALONE):
         return True
     found = MODULE_MARKS.search(text)
     marks = set(re.findall(r'pytest\.mark\.(\w+)', found[1])) if found else set()
-    elsewhere = bool(marks & set(PARTS.values())) and not in_part(marks, part)
-    return True if elsewhere or marks & LEFT_OUT[config.getoption('tier')] else None
-
-
-def in_part(marks: set[str], part: str | None) -> bool:
-    """Return whether a test with some marks belongs to a part."""
-    own = next((name for name in ('alone', 'live') if PARTS[name] in marks), 'beside')
-    return part in (None, own)
+    left_out = LEFT_OUT[config.getoption('tier')] | (ALONE if part == 'beside' else set())
+    return True if marks & left_out else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -96,7 +85,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     chosen, others = [], []
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        (chosen if in_part(marks, part) and not marks & left_out else others).append(item)
+        in_part = part is None or bool(marks & ALONE) == (part == 'alone')
+        (chosen if in_part and not marks & left_out else others).append(item)
     items[:] = chosen
     config.hook.pytest_deselected(items=others)
 
