@@ -223,7 +223,8 @@ def _answer(step: int, contact: StampedMessage) -> tuple[float, ...]:
     depth = max(TOOL_RADIUS_M - device[2], 0.0) if state else 0.0
     head = (step + 1, 0, 1, sequence, *divmod(contact.stamp_ns, 10**9), state, *device)
     stiffness = STIFFNESS_N_PER_M if state else 0.0
-    return (*head, 0.0, 0.0, STIFFNESS_N_PER_M * depth, *(0.0,) * 8, stiffness, *(0.0,) * 10)
+    rest = (0.0, 0.0, 0.0, 0, *(0.0,) * 6)
+    return (*head, 0.0, 0.0, STIFFNESS_N_PER_M * depth, *(0.0,) * 8, stiffness, *rest)
 
 
 @contextmanager
