@@ -135,8 +135,9 @@ def follow_device(edge, strips, device, moved, tissue, law):
         return no_pull(paid, rubbed)
     low, high = _box(edge, device)
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
+    fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
     for _ in range(_MAX_SLIPS):
-        limit, cut, rub = _slip(edge, strips, device, faces, direction, piece, law)
+        limit, cut, rub = _slip(edge, strips, device, faces, direction, piece, law, fresh, limits)
         paid, rubbed = paid + cut, rubbed + rub
         if limit >= 0.0:
             break
@@ -144,8 +145,8 @@ def follow_device(edge, strips, device, moved, tissue, law):
         if not edge.spans.any():
             break
     ways, arms = device - edge.points, SHARES * (POINTS * piece)
-    fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
-    _resist(edge, ways.copy(), faces, direction, piece, law, fresh, limits)
+    if limit < 0.0:
+        _resist(edge, ways.copy(), faces, direction, piece, law, fresh, limits)
     limit, torque_limit = limits.sum(), (limits * arms).sum()
     # As it is pulled now, or will be if the device moves on.
     _resist(edge, moved.copy(), faces, direction, piece, law, fresh, limits)
@@ -421,14 +422,19 @@ def _knots(edge, device):
 
 
 @inner
-def _slip(edge, strips, device, faces, direction, piece, law):
+def _slip(edge, strips, device, faces, direction, piece, law, fresh, limits):
     """Let the points slip whose springs exceed the resistance.
+
+    Args:
+        edge: `Edge`, changed.
+        strips: `Strips`, changed.
+        device: points of the device's edge [m], shape (POINTS, 3).
+        faces, direction, piece, law, fresh, limits: see `_resist`; before the slip.
 
     Returns:
         The largest force that the edge transmits as it is pulled [N], -1 where a point slipped;
         the work of cutting and that of friction [J].
     """
-    fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
     slid, ways = np.zeros(POINTS), device - edge.points
     _resist(edge, ways, faces, direction, piece, law, fresh, limits)
     cutting = False
