@@ -13,6 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Joy
 
 from cutting_trainer.bags.message_class import message_class
+from cutting_trainer.bags.metadata import FORMAT_VERSION
 from cutting_trainer.bags.playback_control import Playhead
 from cutting_trainer.bags.playback_messages import RecordedHand, RecordedStream
 from cutting_trainer.bags.qos_adaptation import publisher_qos
@@ -31,6 +32,7 @@ from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
     PoseStampedCodec,
+    StampedCodec,
     WrenchStampedCodec,
 )
 from cutting_trainer.node_common.operating_state import CrtkState, crtk_types
@@ -164,8 +166,10 @@ class SessionPlayer(Player):
         wanted = (*OF_TISSUE, *FORCES) if drive_device else (*OF_TISSUE, *OF_DEVICE, BUTTON)
         self.topics = [topic for topic in wanted if topic in bag.topics()]
         self._wrench = WrenchStampedCodec('arm_base')
-        # Their fields that an older bag lacks are added.
-        self._grown = {CONTACT: ContactCodec(FRAME), FORCE: ForceSampleCodec(FRAME)}
+        self._grown: dict[str, StampedCodec] = {}
+        if int(bag.custom_data.get('format_version', FORMAT_VERSION)) < FORMAT_VERSION:
+            # Their fields that an older bag lacks are added.
+            self._grown = {CONTACT: ContactCodec(FRAME), FORCE: ForceSampleCodec(FRAME)}
         self._stream = RecordedStream(bag, self.topics, start)
         self._rounds = 0
 

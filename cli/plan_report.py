@@ -12,7 +12,7 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_plan, make_task
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost
 from cutting_trainer.tissue_sim.planner.plan import Plan
-from cutting_trainer.tissue_sim.planner.rejection_reasons import ms, percent
+from cutting_trainer.tissue_sim.planner.rejection_reasons import by_cause, ms, percent
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 
@@ -66,10 +66,9 @@ def report(scene: str, settings: TissueSettings, found: Plan) -> list[str]:
 
 def _chosen(chosen: Candidate, found: Plan) -> list[str]:
     cost, worst, errors = chosen.cost, found.worst, chosen.errors
-    said = [f'{percent(value)} {cause}' for cause, value in errors.causes.items()]
     lines = [
         f'taken: {chosen.name}',
-        f'  error {percent(errors.total)}: {", ".join(said)}',
+        f'  error {percent(errors.total)}: {by_cause(errors)}',
         f'  {ms(cost.frame)} a frame: {_steps(cost)}',
     ]
     if worst is not None and worst != cost:

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from sensor_msgs.msg import Joy
 
 from cutting_trainer.node_common import qos, ros
+from cutting_trainer.node_common.crtk import is_pressed
 from cutting_trainer.node_common.lifecycle import ManagedNode
-from cutting_trainer.node_common.rejections import MessageError
 
 
 class ModeButton:
@@ -29,8 +29,6 @@ class ModeButton:
         Raises:
             MessageError: the message has no such button.
         """
-        if not (self._button < len(message.buttons) and message.buttons[self._button] in (0, 1)):
-            raise MessageError('no such button', f'buttons[{self._button}] has to be 0 or 1')
-        was_held, self._is_held = self._is_held, message.buttons[self._button] == 1
+        was_held, self._is_held = self._is_held, is_pressed(message, self._button)
         if self._is_held and not was_held:
             self._press()

@@ -62,7 +62,8 @@ CLOCK_STEP_NS = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
 
-MODES = ' or '.join(mode.name.lower() for mode in ToolMode)
+MODES = {mode.name.lower(): mode for mode in ToolMode}
+"""Modes of the tool by the names that a scene and the parameter give them."""
 
 
 class HapticBridge(ManagedNode):
@@ -133,7 +134,7 @@ class HapticBridge(ManagedNode):
         self._wiring, self._wiring_due = Wiring(self, self._wrench, understood), 0.0
         text = 'hand force over tissue force [-], above 0 to 100'
         parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
-        text = f'what the tool is: {MODES}; used once it is outside of the tissue'
+        text = f'what the tool is: {" or ".join(MODES)}; used once it is outside of the tissue'
         mode = parameter(self, 'tool_mode', tool.mode, text, settable=True)
         self._path.next_mode = mode_of(mode)
         self._mode_button = None
@@ -377,10 +378,9 @@ def mode_of(name: object) -> ToolMode:
     Raises:
         ValueError: there is none of this name.
     """
-    known = {mode.name.lower(): mode for mode in ToolMode}
-    if name not in known:
-        raise ValueError(f'tool_mode is {name!r:.40}: it must be {MODES}')
-    return known[str(name)]
+    if name not in MODES:
+        raise ValueError(f'tool_mode is {name!r:.40}: it must be {" or ".join(MODES)}')
+    return MODES[str(name)]
 
 
 def of_tissue(scene: Path) -> tuple[float, Friction]:

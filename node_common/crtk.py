@@ -138,6 +138,21 @@ class DeviceState:
             self._machine.fault(self.cause)
 
 
+def is_pressed(message: Joy, button: int) -> bool:
+    """Return whether a button is pressed.
+
+    Args:
+        message: of the device.
+        button: index into its `buttons`.
+
+    Raises:
+        MessageError: the message has no such button.
+    """
+    if not (button < len(message.buttons) and message.buttons[button] in (0, 1)):
+        raise MessageError('no such button', f'buttons[{button}] has to be 0 or 1')
+    return bool(message.buttons[button])
+
+
 class HoldButton:
     """A dead man's switch: PAUSED while `<name>/button` (sensor_msgs/Joy) is not pressed.
 
@@ -155,11 +170,11 @@ class HoldButton:
         self._presses = listen(node, Joy, f'{name}/button', self._event, EVENTS)
 
     def _event(self, message: Joy) -> None:
-        known = bool(message.buttons) and message.buttons[0] in (0, 1)
-        self._pressed = known and message.buttons[0] == 1
-        self.enforce()
-        if not known:  # and counts as let go
-            raise MessageError('no such button', 'buttons[0] has to be 0 or 1')
+        self._pressed = False  # also of a message without the button
+        try:
+            self._pressed = is_pressed(message, 0)
+        finally:
+            self.enforce()
 
     def enforce(self) -> None:
         """Pause or resume as the button requires; call often."""

@@ -46,14 +46,14 @@ def test_a_short_slice_lags_by_its_springs_alone_and_lets_go_when_it_is_withdraw
     simulation, lags = cutter.simulation, []
     for tip in np.concatenate(ways):
         frame = cutter.frame(contact_at(simulation, tip))
-        if simulation._blade is not None:
-            lags.append(simulation._blade.lag)
+        if simulation.blade is not None:
+            lags.append(simulation.blade.lag)
             # Each spring yields at the toughness of its piece; all of them are twice the coupling.
             assert lags[-1] <= TOUGHNESS * EDGE / (2 * COUPLING) + 1e-5
         if tip[2] > TOP + 0.005:
             assert not frame.force.any()
     assert max(lags) > 5e-4
-    assert simulation._blade is None
+    assert simulation.blade is None
 
 
 def turn(rate: float, seconds: float = 1.0) -> tuple[float, float]:
@@ -68,7 +68,7 @@ def turn(rate: float, seconds: float = 1.0) -> tuple[float, float]:
         contact = contact_at(simulation, tip)
         object.__setattr__(contact, 'blade_root', root)
         frame = cutter.frame(contact)
-        blade = simulation._blade
+        blade = simulation.blade
         if blade is None:
             continue
         if last is not None:

@@ -8,7 +8,6 @@ tissue under a small load, of the footprint, and of a hyperelastic one as deep a
 
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, Task
 from cutting_trainer.tissue_sim.planner.contact_errors import contact_error
-from cutting_trainer.tissue_sim.planner.frame_cost import frame_time, tool_depth
+from cutting_trainer.tissue_sim.planner.frame_cost import frame_time, tool_depth, uncut
 from cutting_trainer.tissue_sim.planner.indentation import Indenter, places, settlement
 from cutting_trainer.tissue_sim.planner.plan import plan
 from cutting_trainer.tissue_sim.planner.rejection_reasons import percent
@@ -119,7 +118,7 @@ def measured_frame(task: Task, chosen: Candidate) -> float:
     simulation = TissueSimulation(
         task.mesh,
         task.material,
-        replace(task.resistance, threshold=1e9),
+        uncut(task),
         model=chosen.model,
         stepping=task.stepped_by(chosen),
         active=chosen.active,

@@ -74,7 +74,7 @@ class _Timed(Tissue):
         found.substeps.append(frame.substeps)
         found.force.append(frame.force)
         found.inside.append(frame.state == ContactState.INSIDE)
-        blade = self.simulation._blade
+        blade = self.simulation.blade
         tip = None if blade is None or contact is None else blade._tip - contact.blade_tip
         found.lag.append(0.0 if tip is None else float(np.linalg.norm(tip)))
         found.slow.append(frame.slow_motion)

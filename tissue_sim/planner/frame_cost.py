@@ -123,7 +123,7 @@ class _Timed:
             s, integrator=integrator, min_substeps=min(s.min_substeps, most), max_substeps=most
         )
         self._simulation = TissueSimulation(
-            task.mesh, task.material, _uncut(task), model=model, stepping=stepping, active=active
+            task.mesh, task.material, uncut(task), model=model, stepping=stepping, active=active
         )
         self._contacts = _in_and_out(task, indenter, depth)
         self._times: list[list[float]] = []
@@ -148,7 +148,8 @@ class _Timed:
         return frame_time(integrator, np.min(self._times, axis=0).tolist())
 
 
-def _uncut(task: Task) -> Resistance:
+def uncut(task: Task) -> Resistance:
+    """Return the resistance of a tissue that the blade never enters."""
     return replace(task.resistance, threshold=_NEVER)
 
 
@@ -174,7 +175,7 @@ class _Strokes:
         self._simulation = TissueSimulation(
             task.mesh,
             task.material,
-            _uncut(task),
+            uncut(task),
             model=candidate.model,
             stepping=task.stepped_by(candidate),
             active=active,

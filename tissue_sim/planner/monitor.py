@@ -2,7 +2,7 @@
 
 from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.planner.plan import Plan
-from cutting_trainer.tissue_sim.planner.rejection_reasons import ms, percent
+from cutting_trainer.tissue_sim.planner.rejection_reasons import by_cause, ms, percent
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 
@@ -43,9 +43,9 @@ class PlanMonitor:
         said = [f'not {rejection}' for rejection in self._plan.rejected]
         chosen = self._plan.chosen
         if chosen is not None:
-            causes = ', '.join(f'{percent(v)} {cause}' for cause, v in chosen.errors.causes.items())
             said.append(
-                f'method: {chosen.name}; error {percent(chosen.errors.total)} ({causes}), '
+                f'method: {chosen.name}; '
+                f'error {percent(chosen.errors.total)} ({by_cause(chosen.errors)}), '
                 f'{ms(chosen.cost.frame)} a frame of {ms(self._plan.available)}'
             )
         return said

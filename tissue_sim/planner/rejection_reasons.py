@@ -27,6 +27,11 @@ class Rejection(NamedTuple):
         return f'{self.method}: {self.why}'
 
 
+def by_cause(errors: ErrorEstimate) -> str:
+    """Return the errors of all causes as a phrase."""
+    return ', '.join(f'{percent(value)} {cause}' for cause, value in errors.causes.items())
+
+
 def inaccurate(model: ModelName, errors: ErrorEstimate, budget: Budget) -> Rejection:
     """Return the rejection of a model that is inaccurate with any integrator."""
     causes = {
