@@ -14,6 +14,7 @@ from bench.validate.picture import draw
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.tissue_sim.elasticity.models import MODELS
 from cutting_trainer.tissue_sim.warm_up import warm_up
 
 Results = dict[str, list[Result]]
@@ -110,27 +111,30 @@ def write(folder: Path, results: Results) -> None:
     page.write_text(head + MARK + '\n' + tables(results), encoding='utf-8')
 
 
+def _summary(rows: list[Result], model: str, tolerance: float) -> str:
+    """Return how many results of a model keep the tolerance, and the span of their errors."""
+    own = [row for row in rows if row.model == model]
+    if not own:
+        return ''
+    said = [f'{sum(row.inside(tolerance) for row in own)} of {len(own)}']
+    errors = [100 * row.error for row in own if row.error is not None]
+    if errors:
+        said.append(' to '.join(f'{e:+.1f}' for e in dict.fromkeys((min(errors), max(errors)))))
+    notes = [row.note for row in own if row.error is None and row.note]
+    return '; '.join(said + notes[-1:])
+
+
 def tables(results: Results) -> str:
     """Return the tables of the page: each case by model on its finest mesh."""
-    lines = [
-        f'Machine: {machine()}.\n',
-        '| case | model | tetrahedra | inside | errors | CPU [s] |',
-    ]
-    lines.append('|---|---|---|---|---|---|')
+    lines = [f'Machine: {machine()}.\n', f'| case, tetrahedra | {" | ".join(MODELS)} |']
+    lines.append('|---' * (1 + len(MODELS)) + '|')
     for name, rows in results.items():
-        case = CASES[name]
         finest = max(row.tetrahedra for row in rows)
-        for model in dict.fromkeys(row.model for row in rows):
-            own = [row for row in rows if (row.model, row.tetrahedra) == (model, finest)]
-            errors = [row.error for row in own if row.error is not None]
-            inside = sum(row.inside(case.tolerance) for row in own)
-            span = f'{100 * min(errors):+.1f} to {100 * max(errors):+.1f} %' if errors else '-'
-            notes = len(own) - len(errors)
-            span += f'; {notes} without a value: {own[-1].note}' if notes and own[-1].note else ''
-            cpu = sum(row.cpu for row in own) / len(own)
-            lines.append(
-                f'| `{name}` | {model} | {finest} | {inside} of {len(own)} | {span} | {cpu:.2g} |'
-            )
+        own = [row for row in rows if row.tetrahedra == finest]
+        for variant in dict.fromkeys(row.model.partition(', ')[2] for row in own):
+            suffix = f', {variant}' if variant else ''
+            cells = [_summary(own, model + suffix, CASES[name].tolerance) for model in MODELS]
+            lines.append(f'| `{name}`{suffix}, {finest} | {" | ".join(cells)} |')
     lines += ['\n| case | published | tolerance |', '|---|---|---|']
     for name in results:
         case = CASES[name]
