@@ -40,15 +40,13 @@ _PAGE = """# Speed against accuracy
 
 Written by `./trainer chart`: every elastic model with every integrator, on problems whose solution
 is known by other means. To the right is slower, upwards is worse; the grey line joins the points
-that no other beats in both. A curve is a model with the integrator that is cheapest on its finest
-mesh, dashed the error of its force; the other integrators are faint. Other packages bend the same
-beam in a [run of their own](performance.md#beside-others). Below each picture stands the cost of an
-error of 10 % and of 1 %.
-All digits, both errors and the step: [points.csv](charts/points.csv).
+that no other beats in both. A curve is a model with its cheapest integrator, dashed the error of
+its force; the other integrators are faint. Other packages bend the same beam in a
+[run of their own](performance.md#beside-others). All digits: [points.csv](charts/points.csv).
 
 - **CPU time** is that of one thread for one second of simulated time at {safety:g} of the stable
-  step (`safety`), median of the frames after a warm-up. On this machine ({machine}) a force of
-  the linear model took {reference_cost:.1f} ns a tetrahedron, before and after {after:.1f}.
+  step (`safety`). On this machine ({machine}) a force of the linear model took
+  {reference_cost:.1f} ns a tetrahedron, before and after {after:.1f}.
 - **Error** is that of the displacement under the given load, or of the force for the given
   displacement. It belongs to model and mesh; the integrator matters in free vibration only.
 - Damping: alpha {alpha:g} 1/s, beta {beta:g} s (active region: {region_alpha:g} 1/s,
@@ -58,10 +56,8 @@ All digits, both errors and the step: [points.csv](charts/points.csv).
 {panels}
 ## The methods of the scenes
 
-Is the method of each scene on the front of the panels that resemble it? It is if no other method
-is faster and as near on any mesh, and if it is on the front of all meshes on one of them. To be as
-near is to err no more in the panel, and no more in free vibration: a long implicit step is near
-where nothing moves, and damps what does.
+A method is on the front of a panel if no other is faster and as near on any mesh, and if it is on
+the front of all meshes on one of them. As near: no more error in the panel and in free vibration.
 
 {front}
 """
@@ -163,8 +159,8 @@ def region_sentence(points: list[Point]) -> str:
 
 def _panel(problem: Problem | Vibration | LocalPalpation) -> str:
     return (
-        f'## {problem.title}\n\n![{problem.title}: error against CPU time]'
-        f'(charts/{problem.name}.png)\n\nReference: {problem.reference_name}.\n'
+        f'## {problem.title}\n\n![Error against CPU time](charts/{problem.name}.png)\n\n'
+        f'Reference: {problem.reference_name}.\n'
     )
 
 
