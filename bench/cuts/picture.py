@@ -56,11 +56,8 @@ def write_all(
 
 def table(rows: list[Row]) -> list[str]:
     """Return the rows as a table in Markdown."""
-    head = (
-        'stroke | method | distance [h] rms, largest | elements | step shrink'
-        ' | lost mass [%] | ms a batch, median'
-    )
-    lines = [f'| {head} |', '|---|---|' + '---:|' * 5]
+    head = 'stroke | method | distance [h] rms, largest | elements | step shrink | ms a batch'
+    lines = [f'| {head} |', '|---|---|' + '---:|' * 4]
     for row in rows:
         growth = 100 * (row.elements_after / row.elements_before - 1)
         cells = (
@@ -69,7 +66,6 @@ def table(rows: list[Row]) -> list[str]:
             f'{row.rms_distance_h:.3f}, {row.largest_distance_h:.2f}',
             f'{growth:+.0f} %',
             f'{row.step_shrink:.1f}',
-            f'{abs(row.lost_mass_percent):.1f}',
             f'{row.median_ms:.1f}',
         )
         lines.append(f'| {" | ".join(cells)} |')
