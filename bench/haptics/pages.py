@@ -62,16 +62,12 @@ def run_accuracy(folder: Path, *, as_json: bool = False) -> list[str]:
 
 
 def _errors_table(rows: list[Row]) -> list[str]:
-    """Return a row for each motion; in each cell median, p95, worst and largest jump."""
+    """Return a row for each motion; in each cell median, p95 and worst."""
     laws = list(dict.fromkeys(row.law for row in rows))
     head = ' | '.join(f'`{law}`' for law in laws)
     lines = [f'| motion | {head} |', '|---' * (1 + len(laws)) + '|']
     for motion in dict.fromkeys(row.motion for row in rows):
-        cells = {
-            row.law: (row.median, row.p95, row.worst, row.largest_jump)
-            for row in rows
-            if row.motion == motion
-        }
+        cells = {row.law: (row.median, row.p95, row.worst) for row in rows if row.motion == motion}
         numbers = (', '.join(f'{number:.1f}' for number in cells[law]) for law in laws)
         lines.append(f'| {motion} | {" | ".join(numbers)} |')
     return lines
