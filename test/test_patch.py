@@ -15,12 +15,17 @@ from cutting_trainer.tissue_sim.motion.stability import FrequencyBound
 CELLS, SIZE = (18, 18, 9), 0.004
 
 
-def large() -> tuple[ElasticModel, np.ndarray]:
-    nodes, tets = box(CELLS, SIZE)
+def held(cells: tuple[int, int, int]) -> tuple[ElasticModel, np.ndarray]:
+    nodes, tets = box(cells, SIZE)
     mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
-    assert mesh.node_count > 1.5 * max(compliance.PATCH, stability.PATCH)
     model = ElasticModel(mesh, Material(5000.0, 0.45, 1060.0), 'linear_smoothed')
     return model, np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / model.mass), 3)
+
+
+def large() -> tuple[ElasticModel, np.ndarray]:
+    model, inverse = held(CELLS)
+    assert model.mesh.node_count > 1.5 * max(compliance.PATCH, stability.PATCH)
+    return model, inverse
 
 
 def test_the_compliance_of_a_patch_is_just_below_that_of_the_tissue() -> None:
@@ -66,9 +71,12 @@ def test_a_sliver_in_a_large_tissue_raises_the_bound_as_a_search_of_the_whole_do
     assert bound.omega == pytest.approx(whole, rel=0.02)
 
 
-def test_a_compliance_in_a_large_tissue_outlives_cuts_and_stays_below_the_true_one() -> None:
+@pytest.mark.parametrize('cells', [(8, 8, 6), CELLS])
+def test_a_compliance_outlives_cuts_and_stays_below_the_true_one(
+    cells: tuple[int, int, int],
+) -> None:
     """A blade that cuts in every frame would else begin with nothing each time."""
-    model, inverse = large()
+    model, inverse = held(cells)
     mesh = model.mesh
     rest = mesh.rest.copy()
     middle = rest.max(axis=0) * [0.5, 0.5, 1.0]
@@ -84,7 +92,7 @@ def test_a_compliance_in_a_large_tissue_outlives_cuts_and_stays_below_the_true_o
         least = np.linalg.eigvalsh(exact - found).min()
         assert least > -1e-6 * np.linalg.norm(exact)
         error, without = (1 - np.trace(value) / np.trace(exact) for value in (found, anew))
-        assert error < 0.05
+        assert error < 0.1
         assert cut == 0 or error < 0.5 * without
         assert kept.calls == (3 if cut == 0 else 1)
         gone = np.flatnonzero((far > 0.012) & (far < 0.014))[cut : cut + 1]

@@ -165,14 +165,13 @@ class PointCompliance:
     """Compliance of a point of the tissue, refined frame by frame.
 
     The estimate is B.X + X.B - X.K X for the present X. It is never above the true compliance
-    B.K^-1 B and converges to it. The solution is kept while the contact stays near, so a few steps
-    per frame suffice. In a large tissue only the PATCH nodes around the point yield, and the others
-    are held.
+    B.K^-1 B and converges to it. The solution is kept while the contact stays near, and over cuts,
+    so a few steps per frame suffice. In a large tissue only the PATCH nodes around the point yield,
+    and the others are held.
 
     Args:
-        steps: conjugate-gradient steps per call and direction. In a large tissue, where the
-            solution survives cuts, and with a law there are at most twice as many for all
-            directions.
+        steps: conjugate-gradient steps per call and direction. In a large tissue and with a law,
+            they are shared by the directions.
         most: nodes that yield in a large tissue.
 
     Attributes:
@@ -226,7 +225,7 @@ class PointCompliance:
         loads, residuals = np.empty((2, len(axes), len(at)))
         spans, steps = spans_of(patch), self._steps
         if len(patch) < n or model.lawful:
-            steps = min(steps, 2 * steps // len(axes))
+            steps //= len(axes)
         for axis, load, x, residual in zip(axes, loads, self._x, residuals, strict=True):
             b[at] = 0.0
             b.reshape(-1, 3)[nodes] = weights[:, None] * axis
@@ -248,10 +247,15 @@ class PointCompliance:
         return (vectors * np.clip(sizes, 0.0, MAX_COMPLIANCE)) @ vectors.T
 
     def _begin(self, axes: int, n: int) -> None:
-        """Allocate directions and nodes; a large tissue keeps its solution."""
-        if n <= self._most or len(self._x) != axes:
-            self._x, self._held = np.zeros((axes, 3 * n)), np.zeros((5, 3 * n))
-            self._patch = np.zeros(0, np.int64)
-        elif self._x.shape[1] < 3 * n:
+        """Allocate directions and nodes; the solution so far stays."""
+        if len(self._x) != axes:
+            self._x, self._patch = np.zeros((axes, 0)), np.zeros(0, np.int64)
+        known = self._x.shape[1]
+        if n <= self._most and known != 3 * n:
+            x = np.zeros((axes, 3 * n))
+            x[:, : min(known, 3 * n)] = self._x[:, : 3 * n]
+            self._x, self._patch = x, self._patch[self._patch < n]
+        elif known < 3 * n:
             self._x = grown(self._x.T, 3 * n).T.copy()
+        if self._held.shape[1] != self._x.shape[1]:
             self._held = np.zeros((5, self._x.shape[1]))
