@@ -81,8 +81,8 @@ class MaterialSettings(SceneModel):
         default=0.0,
         ge=0,
         le=2,
-        description='dry friction of the tool on the surface: tangential over normal force of a '
-        'tool that slides [-], 0 to 2; 0: none',
+        description='dry friction of the tool on the surface, and of cut faces on each other: '
+        'tangential over normal force of what slides [-], 0 to 2; 0: none',
     )
     static_friction_ratio: float = Field(
         default=1.0,
@@ -93,7 +93,7 @@ class MaterialSettings(SceneModel):
 
     @property
     def dry_friction(self) -> Friction:
-        """The friction of the tool on the surface."""
+        """The friction of the tool on the surface, and of cut faces."""
         return Friction(self.friction, self.static_friction_ratio)
 
     @model_validator(mode='after')

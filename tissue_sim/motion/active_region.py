@@ -162,6 +162,7 @@ class ActiveRegion:
         inverse_mass: np.ndarray,
         coupling: Coupling,
         seconds: float,
+        met: tuple[np.ndarray, np.ndarray | None],
     ) -> Region:
         """Select the moving nodes, and stop those that go to sleep.
 
@@ -175,6 +176,8 @@ class ActiveRegion:
             inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
             coupling: the tool's spring.
             seconds: duration of a frame [s].
+            met: nodes of cut faces in contact, with repeats, shape (c,), and their forces on all
+                nodes [N], shape (n, 3), None without any; they sleep together.
         """
         if self.whole:
             operands = self._model.operands()
@@ -183,11 +186,17 @@ class ActiveRegion:
         damped, f = self._room(len(u))
         _ahead(operands.reach, u, v, beta, damped)
         internal_force(operands, damped, f, 1)
+        touching, pressed = met
+        if pressed is not None:
+            near = np.unique(touching)
+            f.reshape(-1, 3)[near] -= pressed[near]
         tolerance = self._settings.tolerance
         _measure(f, v, inverse_mass, seconds, tolerance, looked, self._quiet)
         restless = looked[self._quiet[looked] < _CHOICES_TO_SLEEP]
         seeds = np.concatenate([restless, coupling.nodes])
         awake = self._model.neighbours.around(seeds, self._rings)
+        if pressed is not None and np.isin(touching, awake).any():
+            awake = self._model.neighbours.around(np.concatenate([seeds, touching]), self._rings)
         v.reshape(-1, 3)[without(self._awake, awake)] = 0.0
         region = self._region
         if region is None or not np.array_equal(awake, self._awake) or _misses(region, coupling):
@@ -225,6 +234,10 @@ class ActiveRegion:
         if self._scratch.shape[1] != size:
             self._scratch = np.zeros((2, size))
         return self._scratch
+
+    def move(self, nodes: np.ndarray) -> np.ndarray:
+        """Return whether nodes move, in their shape."""
+        return np.full(nodes.shape, True) if self.whole else np.isin(nodes, self._awake)
 
     def follow_cut(self, touched: Touched) -> None:
         """Wake the nodes touched by a cut."""

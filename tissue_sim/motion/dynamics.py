@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling, Spring, Tool
+from cutting_trainer.tissue_sim.contact.cut_contact import NO_CUT_CONTACTS, CutContact, CutContacts
+from cutting_trainer.tissue_sim.contact.cut_contact_search import NO_NEAR_FACES, NearFaces
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
@@ -78,6 +80,10 @@ class Dynamics:
         stepping: time stepping.
         active: selection of the moving nodes.
         gravity: acceleration [m/s^2].
+        friction: coefficient between cut faces.
+
+    Attributes:
+        cut_contact: of cut faces; with `implicit` they do not meet.
 
     Raises:
         ValueError: the integrator has no stable step with this damping.
@@ -91,8 +97,10 @@ class Dynamics:
         stepping: TimeStepping | None = None,
         active: ActiveSettings | None = None,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        friction: float = 0.0,
     ) -> None:
         self.mesh = mesh
+        self.cut_contact = CutContact(mesh, friction)
         self.material = material
         self.model = ElasticModel(mesh, material, model)
         loaded = bool(material.prony) or any(gravity)
@@ -244,17 +252,19 @@ class Dynamics:
         substeps, dt = self._substeps(coupling)
         self._hold_back(tool is None and coupling.mode == FREE)
         before = (self._u.copy(), self._v.copy())
+        met = self.cut_contact.kept()
         relieved = None if self.loads is None else self.loads.kept()
         trouble = ''
         while True:
-            work = self._integrate(coupling, dt, substeps, tool)
-            motion = self._motion(dt, substeps, trouble)
+            work, contacts = self._integrate(coupling, dt, substeps, tool)
+            motion = self._motion(dt, substeps, trouble, contacts)
             energy = motion.kinetic_energy + motion.elastic_energy
             found = self._detector.diagnose(self.displacement, energy, work)
             if not found:
                 return motion
             if self.loads is not None:
                 self.loads.restore(relieved)
+            self.cut_contact.restore(met)
             if self._hold_lost(*before):
                 trouble = f'{found}: a piece that nothing held, which stays there from now on'
                 continue
@@ -320,7 +330,7 @@ class Dynamics:
         self._u, self._v = grown(self._u, size), grown(self._v, size)
         return self._u[:size], self._v[:size]
 
-    def _choose(self, coupling: Coupling) -> Region:
+    def _choose(self, coupling: Coupling, contacts: NearFaces) -> Region:
         u, v = self._state()
         if isinstance(self._active, FarField):
             if coupling.mode == FREE:
@@ -328,9 +338,16 @@ class Dynamics:
                 self._elastic.whole(self.displacement)
             return self._active.choose(u, v, self._elastic.force, self.inverse_mass, coupling)
         b = self.material.beta
-        return self._active.choose(u, v, b, self.inverse_mass, coupling, self._frame_time)
+        some = len(contacts.nodes) and not self._active.whole
+        pressed = self.cut_contact.force(contacts, u, v) if some else None
+        at = u, v, b, self.inverse_mass
+        met = contacts.nodes.ravel(), pressed
+        return self._active.choose(*at, coupling, self._frame_time, met)
 
-    def _integrate(self, coupling: Coupling, dt: float, substeps: int, tool: Tool | None) -> float:
+    def _integrate(
+        self, coupling: Coupling, dt: float, substeps: int, tool: Tool | None
+    ) -> tuple[float, NearFaces]:
+        """Move the tissue by a frame; return the work of the tool [J], and what is in contact."""
         size = 3 * self.mesh.node_count
         moving = self._state()[1][:size]
         calm = self.loads is None or self.loads.settled
@@ -339,7 +356,7 @@ class Dynamics:
             # Decay would continue into denormal numbers, at a hundred times the cost.
             if self._still >= _STILL_FRAMES:
                 moving[:] = 0.0
-                return 0.0
+                return 0.0, NO_NEAR_FACES
             self._still += 1
         else:
             self._still = 0
@@ -348,10 +365,23 @@ class Dynamics:
         work, done, whole = 0.0, 0, np.array([[0, self.mesh.node_count]])
         part, parts = 1, 1 if tool is None else tool.parts
         region: Region | None = None
-        adapt = 0
+        adapt, look, near, contacts = 0, substeps, NO_NEAR_FACES, NO_NEAR_FACES
+        faces: CutContacts | None = None
+        if self.cut_contact.possible and self.stepping.integrator != 'implicit':
+            look = 0
         while done < substeps:
-            if region is None or not self._active.whole:
-                region = self._choose(coupling)
+            anew = region is None or not self._active.whole
+            if faces is not None and (done >= look or anew):
+                self.cut_contact.keep(contacts, faces)
+                faces = None
+            if done >= look:
+                near, known = self.cut_contact.find(self.displacement, self.velocity, dt, substeps)
+                look = done + known
+            if region is None or anew:
+                region = self._choose(coupling, near)
+            if faces is None:
+                contacts = near.among(self._active.move(near.nodes))
+                faces = self._meeting(contacts, region)
             steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
             if self._stiffened is not None:
                 if done >= adapt:
@@ -363,12 +393,12 @@ class Dynamics:
                 steps = min(steps, adapt - done)
             if self.loads is not None:
                 steps = min(steps, self.loads.substeps(dt) or steps)
-            steps = min(steps, max(part * substeps // parts - done, 1))
-            work += self._steps(region, spring, dt, steps, first=done, total=substeps)
+            steps = min(steps, max(part * substeps // parts - done, 1), max(look - done, 1))
+            work += self._steps(region, spring, faces, dt, steps, first=done, total=substeps)
             done += steps
             if self.loads is not None:
-                near = whole if self._active.whole else spans_of(self._active.near)
-                self.loads.advance(self._u[:size], dt * steps, near)
+                spans = whole if self._active.whole else spans_of(self._active.near)
+                self.loads.advance(self._u[:size], dt * steps, spans)
             if tool is not None and done >= part * substeps // parts:
                 part += 1
                 if self._detector.has_left(self.displacement):
@@ -381,10 +411,31 @@ class Dynamics:
                     region = None
         if self._far is not None:
             self._far.follow(*self._state(), size)
-        return work
+        if faces is not None:
+            self.cut_contact.keep(contacts, faces)
+        return work, contacts
+
+    def _meeting(self, contacts: NearFaces, region: Region) -> CutContacts:
+        """Return contacts as the operand of the region's kernels."""
+        if len(contacts.nodes) == 0:
+            return NO_CUT_CONTACTS
+        place, (u, v) = region.place, self._state()
+        if place is None:
+            return self.cut_contact.operand(contacts, contacts.nodes, u, v)
+        return self.cut_contact.operand(
+            contacts, place.local[contacts.nodes], u[place.at], v[place.at]
+        )
 
     def _steps(
-        self, region: Region, spring: Spring, dt: float, steps: int, *, first: int, total: int
+        self,
+        region: Region,
+        spring: Spring,
+        faces: CutContacts,
+        dt: float,
+        steps: int,
+        *,
+        first: int,
+        total: int,
     ) -> float:
         """Move the nodes of a region by some substeps; return the work of the spring [J]."""
         place = region.place
@@ -396,9 +447,11 @@ class Dynamics:
         operands = region.operands
         if place is not None and self.loads is not None:
             operands = operands._replace(load=self.model.load[place.at[: 3 * place.moving]])
+        inverse = inverse[at]
+        faces.inverse[:] = inverse[faces.at]
         work = self._integrator.step(
             operands,
-            inverse[at],
+            inverse,
             diagonal[at],
             spring if place is None else place.spring(spring),
             u,
@@ -408,6 +461,7 @@ class Dynamics:
             spans=region.spans,
             first=first,
             total=total,
+            faces=faces,
         )
         if place is not None:  # else u and v are the tissue's own
             own = 3 * place.moving
@@ -419,8 +473,10 @@ class Dynamics:
         stiffened, base = self._stiffened, self.inverse_mass
         return base if stiffened is None else stiffened.inverse(base)
 
-    def _motion(self, dt: float, substeps: int, trouble: str) -> FrameMotion:
+    def _motion(self, dt: float, substeps: int, trouble: str, contacts: NearFaces) -> FrameMotion:
         force, elastic = self._elastic_now()
+        if len(contacts.nodes):
+            force = force - self.cut_contact.force(contacts, *self._state())
         elastic += self._load_energy()
         kinetic = self._kinetic_energy()
         slow = dt * substeps / self._frame_time
@@ -457,6 +513,7 @@ class Dynamics:
         n, total = self.mesh.node_count, self.mesh.node_count + len(delta.node_parents)
         unknowns = self._state()[1][3 * n :].copy()
         touched = self.mesh.apply(delta)
+        self.cut_contact.apply_cut(n, delta, touched)
         self._u, self._v = grown(self._u, 3 * total), grown(self._v, 3 * total)
         for values in (self._u, self._v):
             carried_over(values[: 3 * total].reshape(-1, 3), n, delta, touched)
@@ -480,6 +537,7 @@ class Dynamics:
         self.displacement[:] = displacement
         self.velocity[:] = 0.0
         self._loose = None
+        self.cut_contact.release()
         if self.loads is not None:
             self.loads.relax(self._u[: 3 * self.mesh.node_count])
         self.restart()

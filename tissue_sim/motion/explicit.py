@@ -12,6 +12,7 @@ from cutting_trainer.tissue_sim.contact.coupling import (
     start_of_work,
     subtract_spring,
 )
+from cutting_trainer.tissue_sim.contact.cut_contact import meet, subtract_pulls
 from cutting_trainer.tissue_sim.elasticity.models import internal_force
 
 # Slices begin at 0: a possibly negative index would prevent vectorisation.
@@ -54,8 +55,9 @@ def _stage(f, inverse_mass, u, v, us, vs, du, dv, alpha, share, ahead):
 
 @kernel(error_model='numpy')
 def euler_steps(
-    operands, spans, inverse_mass, damping, spring, u, v, work, dt, first, steps, total, symplectic
-):
+    operands, spans, inverse_mass, damping, spring, faces, u, v, work, dt, first, steps, total,
+    symplectic,
+):  # fmt: skip
     """Compute steps of Euler's methods: v by its rate at the start of the step, u by the v at start
     or end.
 
@@ -68,6 +70,7 @@ def euler_steps(
         inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
         damping: alpha [1/s] and beta [s].
         spring: the coupling, with its law, see `coupling.Spring`.
+        faces: contacts of cut faces, see `cut_contact.CutContacts`.
         u, v: displacement [m] and velocity [m/s], changed in place, shape (3 n,).
         work: scratch, shape (6, >= 3 n).
         dt: step [s].
@@ -88,6 +91,8 @@ def euler_steps(
         _ahead(q[a:b], u[a:b], v[a:b], beta)
     for step in range(first, first + steps):
         internal_force(operands, q, f, 1)
+        if faces.at.shape[0] > 0:
+            subtract_pulls(faces, f)
         if spring.mode != 0:
             subtract_spring(spring, step / total, held, f, force)
             if not symplectic:
@@ -97,6 +102,8 @@ def euler_steps(
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
             _euler(u[a:b], v[a:b], q[a:b], f[a:b], inverse_mass[a:b], alpha, beta, dt, symplectic)
+        if faces.at.shape[0] > 0:
+            meet(faces, u, v, q, beta, dt)
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)
@@ -104,7 +111,9 @@ def euler_steps(
 
 
 @kernel(error_model='numpy')
-def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, first, steps, total):
+def rk4_steps(
+    operands, spans, inverse_mass, damping, spring, faces, u, v, work, dt, first, steps, total
+):
     """Compute steps of the classical fourth-order Runge-Kutta method on u and v together.
 
     Thesis 4.4.3, with the velocity updated by its own stages. Arguments and result: see
@@ -129,6 +138,8 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
                 a, b = 3 * spans[s, 0], 3 * spans[s, 1]
                 _ahead(q[a:b], us[a:b], vs[a:b], beta)
             internal_force(operands, q, f, 1)
+            if faces.at.shape[0] > 0:
+                subtract_pulls(faces, f)
             if spring.mode != 0:
                 at = (step + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / total
                 subtract_spring(spring, at, us, f, force)
@@ -146,6 +157,8 @@ def rk4_steps(operands, spans, inverse_mass, damping, spring, u, v, work, dt, fi
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
             u[a:b] += du[a:b]
             v[a:b] += dv[a:b]
+        if faces.at.shape[0] > 0:
+            meet(faces, u, v, q, beta, dt)
     if spring.mode != 0:
         force_of_spring(spring, (first + steps) / total, u, force)
         done += spring_work(spring, force, u, last)

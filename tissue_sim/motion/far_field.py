@@ -315,6 +315,10 @@ class FarField:
         self._grid.follow_cut(touched, self._take_out)
         self._changed = True
 
+    def move(self, nodes: np.ndarray) -> np.ndarray:
+        """Return whether nodes move on their own, or not at all, in their shape."""
+        return (self._level[nodes] == 0) | (self._model.mesh.fixed[nodes] == 1)
+
     def ahead(self, left: int, total: int, shortened: float) -> int:
         """Return the number of substeps until the next choice: all of the frame."""
         return left

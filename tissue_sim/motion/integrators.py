@@ -5,6 +5,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.coupling import Spring
+from cutting_trainer.tissue_sim.contact.cut_contact import NO_CUT_CONTACTS, CutContacts
 from cutting_trainer.tissue_sim.elasticity.models import Operands
 from cutting_trainer.tissue_sim.motion.explicit import euler_steps, rk4_steps
 from cutting_trainer.tissue_sim.motion.implicit import implicit_steps
@@ -44,6 +45,7 @@ class Integrator:
         spans: np.ndarray | None = None,
         first: int = 0,
         total: int | None = None,
+        faces: CutContacts = NO_CUT_CONTACTS,
     ) -> float:
         """Advance displacement and velocity in place.
 
@@ -58,6 +60,7 @@ class Integrator:
             spans: intervals of moving nodes, None: all, shape (s, 2).
             first: number of the first step in its frame.
             total: steps of the frame, None: `steps`; the tool moves through all of them.
+            faces: contacts of cut faces; `implicit` leaves them out.
 
         Returns:
             Work of the spring on the tissue [J].
@@ -72,5 +75,5 @@ class Integrator:
         if self.name == 'implicit':
             return float(implicit_steps(*head, diagonal, self._tolerance, *tail))
         if self.name == 'rk4':
-            return float(rk4_steps(*head, *tail))
-        return float(euler_steps(*head, *tail, self.name == 'symplectic_euler'))
+            return float(rk4_steps(*head, faces, *tail))
+        return float(euler_steps(*head, faces, *tail, self.name == 'symplectic_euler'))

@@ -39,7 +39,7 @@ class TissueSimulation:
         stretch: relative displacement of the fixed nodes along x, y and z before the session (0.05:
             by 5 %): the pre-tension under which a cut opens.
         contact: how the load of a tool is spread, see `ToolSprings`.
-        friction: of the tool on the surface.
+        friction: of the tool on the surface, and of cut faces on each other.
         gravity: acceleration [m/s^2]; `Dynamics.settle` finds the shape at rest under it.
 
     Raises:
@@ -62,7 +62,7 @@ class TissueSimulation:
     ) -> None:
         self.mesh = mesh
         self.material = material
-        self.dynamics = Dynamics(mesh, material, model, stepping, active, gravity)
+        self.dynamics = Dynamics(mesh, material, model, stepping, active, gravity, friction.sliding)
         self.step = 0
         self.state = ContactState.NONE
         self.elements_cut = 0

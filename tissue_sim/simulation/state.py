@@ -7,6 +7,7 @@ import numpy as np
 from cutting_trainer.tissue_sim.contact import (
     blade,
     coupling,
+    cut_contact,
     edge,
     footprint,
     fracture,
@@ -80,6 +81,7 @@ _MODULES = (
     friction,
     guard,
     integrators,
+    cut_contact,
     loads,
     local_rows,
     material,

@@ -136,6 +136,9 @@ def check_simulation(simulation: TissueSimulation) -> None:
     for name in ('_u', '_v', '_inverse'):
         has_room(name, getattr(dynamics, name), 3 * n)
     has_room('_inertia', dynamics._inertia, n)
+    has_room('_pull', dynamics.cut_contact._pull, 0, 3)
+    if dynamics.cut_contact._mesh is not mesh:
+        raise StateError('the cut faces are of another tissue')
     if dynamics._loose is not None:
         within('_loose', dynamics._loose, n)
     _check_loads(dynamics, n)
