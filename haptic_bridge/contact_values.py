@@ -30,7 +30,7 @@ def contact_values(
     state: int,
     surface: Surface | None,
     touched: Any,
-    tool: tuple[np.ndarray, np.ndarray, np.ndarray],
+    tool: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     spring: tuple[float, float],
     mode: int,
 ) -> tuple[float, ...]:
@@ -41,7 +41,8 @@ def contact_values(
         state: NONE, TOUCHING or INSIDE.
         surface: the newest of the tissue.
         touched: contact of the proxy, or the triangle it approaches; None while it is not used.
-        tool: tip [m], shape (3,), force on the tissue [N], shape (3,), blade [m], shape (2, 3).
+        tool: tip [m], shape (3,), force on the tissue [N], shape (3,), blade [m], shape (2, 3),
+            direction that its edge faces, shape (3,).
         spring: stiffness of the coupling [N/m], radius of the tool [m].
         mode: of the tool, one of `ToolMode`.
     """
@@ -73,4 +74,5 @@ def contact_values(
         radius,
         0,  # the tool's number in the list of the scene
         mode,
+        *tool[3].tolist(),
     )

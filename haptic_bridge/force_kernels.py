@@ -38,6 +38,7 @@ SETUP = record_type(
         ('scale', 'f8'),
         ('force_scale', 'f8'),
         ('blade', 'f8', (2, 3)),  # root and tip [m], tool frame
+        ('facing', 'f8', (3,)),  # of its edge, tool frame; zero: all round
         ('coupling', 'f8'),  # [N/m]
         ('law', 'i8'),
         ('one_force', 'b1'),
@@ -59,6 +60,7 @@ STATE = record_type(
         ('orientation', 'f8', (4,)),  # x y z w, device frame
         ('tip', 'f8', (3,)),  # [m], tissue frame
         ('blade', 'f8', (2, 3)),  # root and tip [m], tissue frame
+        ('facing', 'f8', (3,)),  # of its edge, tissue frame
         ('arms', 'f8', (2, 3)),  # [m] from the tip to root and tip of the blade, tissue frame
         ('moved', 'f8', (3,)),  # [m] since the last tick, device frame
         ('turned', 'f8', (3,)),  # [rad] since the last tick, rotation vector, device frame
@@ -93,6 +95,7 @@ def make_setup(
     setup['scale'] = frame.scale
     setup['force_scale'] = haptics.force_scale
     setup['blade'] = (tool.blade_root, tool.blade_tip)
+    setup['facing'] = tool.facing()
     setup['coupling'] = tool.coupling_stiffness
     setup['law'] = extrapolation.LAWS[haptics.extrapolation]
     setup['one_force'] = haptics.forces == 'one'
@@ -169,6 +172,11 @@ def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
             for j in range(3):
                 s.blade[end, k] += c.rotation[k, j] * arm[j]
                 s.arms[end, k] += c.rotation[k, j] * arm[j]
+    _rotate(s.orientation, c.facing, 1.0, arm)
+    for k in range(3):
+        s.facing[k] = 0.0
+        for j in range(3):
+            s.facing[k] += c.rotation[k, j] * arm[j]
 
 
 @inner

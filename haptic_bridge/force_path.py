@@ -101,8 +101,11 @@ class ForcePath:
         self._force, self._wrench, self._tip, self._external, self._blade, self._arms = map(
             self._s.__getitem__, names
         )
+        self._facing = self._s['facing']
         self._plausibility = ContactPlausibility(tool, tool.coupling_stiffness)
         self._length = math.dist(tool.blade_root, tool.blade_tip)
+        if any(tool.blade_facing):  # spine and flat do not cut: they stretch the coupling
+            edge_resistance = max(edge_resistance, tool.coupling_stiffness)
         self._max_resistance = edge_resistance * self._length
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._grips = friction.sliding > 0.0
@@ -245,7 +248,7 @@ class ForcePath:
             self._contact,
             surface,
             touched,
-            (self._tip, self._external, self._blade),
+            (self._tip, self._external, self._blade, self._facing),
             self._tail,
             self.mode,
         )

@@ -17,6 +17,8 @@ from cutting_trainer.tissue_sim.contact.tool import MIN_RADIUS_M
 
 Vector = tuple[float, float, float]
 Edge = Annotated[float, Field(gt=0, le=5)]
+_MIN_SINE = 0.01
+"""Of the angle between a blade and the direction that its edge faces."""
 
 
 class SettingsError(ValueError):
@@ -36,7 +38,11 @@ class ToolSettings(SceneModel):
     blade_tip: Vector = Field(
         (0.0, 0.0, -0.004), description='[m] end of the cutting edge at the tip, tool frame'
     )
-
+    blade_facing: Vector = Field(
+        (0.0, 0.0, 0.0),
+        description='direction across the blade in which its edge cuts, tool frame; spine and '
+        'flat carry the tissue along, uncut. [0, 0, 0]: it cuts all round',
+    )
     mode: Literal['scalpel', 'palpator'] = Field(
         'scalpel',
         description='what the tool is at first; a palpator never goes in. The parameter '
@@ -47,7 +53,22 @@ class ToolSettings(SceneModel):
     def _blade_has_length(self) -> 'ToolSettings':
         if np.linalg.norm(np.subtract(self.blade_root, self.blade_tip)) < 1e-4:
             raise ValueError('blade_root and blade_tip coincide: a blade is at least 0.1 mm long')
+        if any(self.blade_facing) and np.linalg.norm(self.facing()) == 0.0:
+            raise ValueError(
+                f'blade_facing {list(self.blade_facing)} is along the blade: give a direction '
+                'across it, for example [1, 0, 0]'
+            )
         return self
+
+    def facing(self) -> np.ndarray:
+        """Return the unit vector across the blade from spine to edge, or zero, shape (3,)."""
+        along = np.subtract(self.blade_tip, self.blade_root)
+        along /= np.linalg.norm(along)
+        across = self.blade_facing - along * (along @ self.blade_facing)
+        size = float(np.linalg.norm(across))
+        if size <= _MIN_SINE * np.linalg.norm(self.blade_facing):
+            return np.zeros(3)
+        return np.asarray(across / size)
 
 
 class Transform(SceneModel):

@@ -47,6 +47,7 @@ tool:
   # Tool frame: origin at the tip (centre of the sphere), z up the handle; the blade cuts along +x.
   blade_root: [0, 0, {root:.4g}]
   blade_tip: [0, 0, {tip:.4g}]
+  blade_facing: [1, 0, 0]
 
 device:
   profile: emulated

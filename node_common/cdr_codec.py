@@ -238,8 +238,9 @@ class ContactCodec(StampedCodec):
         ('proxy_radius', 'd', 1),
         ('tool', 'B', 1),
         ('mode', 'B', 1),
+        ('blade_facing', 'd', 3),
     )
-    older = (15, 16)
+    older = (15, 16, 17)
 
 
 class ForceSampleCodec(StampedCodec):

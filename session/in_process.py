@@ -152,6 +152,7 @@ def tool_contact(values: Sequence[float]) -> ToolContact:
         sequence=int(get('sequence')[0]),
         external=get('external_force'),
         mode=ToolMode(int(get('mode')[0])),
+        blade_facing=get('blade_facing'),
     )
 
 

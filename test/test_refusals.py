@@ -54,6 +54,7 @@ def contact(**changed: Any) -> SimpleNamespace:
         'proxy_radius': 0.004,
         'tool': 0,
         'mode': 0,
+        'blade_facing': np.zeros(3),
     }
     for name in ('device', 'proxy', 'point', 'blade_root', 'blade_tip', 'external_force'):
         fields[name] = np.zeros(3)
@@ -111,6 +112,7 @@ def test_a_contact_of_before_a_cut_that_took_nodes_away_is_none_of_its_nodes() -
         ({'state': 3}, 'no such state'),
         ({'tool': 1}, 'no such tool'),
         ({'mode': 2}, 'no such mode of the tool'),
+        ({'blade_facing': np.array([0.6, 0.0, 0.6])}, 'no unit vector'),
         ({'nodes': np.full(9, 2**32 - 1, np.uint32)}, 'index out of range'),
         ({'weights': np.full(9, 0.5)}, 'invalid weights'),
         ({'normal': np.array([0.0, 0.0, 1.1])}, 'invalid normal'),

@@ -103,6 +103,7 @@ def test_fields_are_named_as_in_the_message(codec):
     [
         (ContactCodec, 'tool'),
         (ContactCodec, 'mode'),
+        (ContactCodec, 'blade_facing'),
         (ForceSampleCodec, 'tool'),
         (ForceSampleCodec, 'torque'),
     ],
@@ -118,11 +119,11 @@ def test_what_messages_of_older_bags_lack_is_zero(codec, older):
     data, lacking = Older('tissue').encode(5, values), codec.fields[names[-1]].stop - count
     assert codec().decode(data) == (5, 'tissue', (*values, *(0,) * lacking))
     assert codec().decode(codec('tissue').encode(5, values)) == codec().decode(data)
-    for wrong in (values[:-2], (*values, *(0,) * (lacking + 1))):
+    for wrong in (values[:-3], (*values, *(0,) * (lacking + 1))):
         with pytest.raises(WireError, match='flat numbers'):
             codec('tissue').encode(5, wrong)
     with pytest.raises(WireError, match='wrong length'):
-        codec().decode(data[:-2])
+        codec().decode(data[:-4])
 
 
 def test_nan_and_infinity_pass_for_a_gate_behind_the_codec_to_judge():

@@ -132,7 +132,9 @@ def _axes(tool: ToolSettings) -> Floats:
     """Return unit vectors along the edge to the tip, to the spine, and across, shape (3, 3)."""
     along = np.subtract(tool.blade_tip, tool.blade_root)
     along /= np.linalg.norm(along)
-    back = -np.eye(3)[int(np.argmin(np.abs(along)))]  # it cuts along +x where it can
+    facing = tool.facing()
+    # A blade that cuts all round is drawn facing +x where it can.
+    back = -facing if facing.any() else -np.eye(3)[int(np.argmin(np.abs(along)))]
     back -= along * (back @ along)
     back /= np.linalg.norm(back)
     return np.stack([along, back, np.cross(along, back)])

@@ -18,7 +18,6 @@ from cutting_trainer.tissue_sim.contact.edge import (
     SHARES,
     WHOLE,
     Edge,
-    Law,
     Pull,
     Tissue,
     carry_edge,
@@ -26,7 +25,8 @@ from cutting_trainer.tissue_sim.contact.edge import (
     gather_loads,
     no_pull,
 )
-from cutting_trainer.tissue_sim.contact.fracture import Strips
+from cutting_trainer.tissue_sim.contact.facing import BLADE_HEIGHT, Law
+from cutting_trainer.tissue_sim.contact.fracture import BLADE_THICKNESS, Strips
 from cutting_trainer.tissue_sim.mesh.locate import NearElements
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, tetrahedron_volumes
 
@@ -94,6 +94,7 @@ class Blade:
         resistance: of the tissue.
         root, tip: the device's edge [m], shape (3,).
         hint: a tetrahedron near the entry.
+        line_compliance: of the tissue, see `Material.line_compliance` [m^2/N].
 
     Attributes:
         immersed: length of the edge in the tissue [m].
@@ -106,9 +107,15 @@ class Blade:
     """
 
     def __init__(
-        self, resistance: Resistance, root: np.ndarray, tip: np.ndarray, hint: int
+        self,
+        resistance: Resistance,
+        root: np.ndarray,
+        tip: np.ndarray,
+        hint: int,
+        line_compliance: float = 0.0,
     ) -> None:
-        self._law = Law(1.0, resistance.toughness, resistance.friction)
+        spine = float(line_compliance * np.log(BLADE_HEIGHT / BLADE_THICKNESS))
+        self._law = Law(1.0, resistance.toughness, resistance.friction, np.zeros(3), spine)
         self._device = np.array([root, tip])
         self._moved = np.zeros((POINTS, 3))
         self._state = Edge(
@@ -129,7 +136,7 @@ class Blade:
         self._element = 0.0
         self._back: np.ndarray | None = None
         self._failed = self._set_back = False
-        self.paid = self.rubbed = 0.0
+        self.paid = self.rubbed = self._confirmed = 0.0
         self._settle(no_pull(0.0, 0.0))
 
     @property
@@ -178,6 +185,7 @@ class Blade:
         device: np.ndarray,
         moved: np.ndarray,
         stiffness: float,
+        facing: np.ndarray,
     ) -> None:
         """Let the edge slip after the device's edge.
 
@@ -189,13 +197,14 @@ class Blade:
             device: root and tip of the device's edge [m], shape (2, 3).
             moved: their motion [m], shape (2, 3).
             stiffness: of the coupling [N/m].
+            facing: see `ToolContact.blade_facing`.
         """
         if self._element == 0.0:
             some = mesh.tetrahedra[:: 1 + len(mesh.tetrahedra) // _MEDIAN_SAMPLES]
             volumes = tetrahedron_volumes(mesh.rest, some)
             self._element = 2 * float(np.cbrt(np.median(volumes)))
         self._device, self._moved = device.copy(), points_of(moved)
-        self._law = self._law._replace(stiffness=stiffness / WHOLE)
+        self._law = self._law._replace(stiffness=stiffness / WHOLE, facing=facing)
         points, edge = points_of(device), self._state.points
         # No point gets farther from the device's than the farthest is.
         margin = 1e-6 + float(np.sqrt(np.square(points - edge).sum(axis=1).max()))
@@ -264,6 +273,10 @@ class Blade:
         self.limit, self.lag = float(pull.limit), float(pull.lag)
         self.paid += float(pull.paid)
         self.rubbed += float(pull.rubbed)
+        free = self.paid - self._confirmed <= self._law.toughness * _MIN_AREA
+        if pull.held and free and not self._failed and self._law.toughness > 0.0:
+            # Spine or flat have carried the tissue along: nothing is to be opened.
+            self._cut_tip, self._cut_edge = self._tip.copy(), self._edge.copy()
         length = float(np.linalg.norm(root - tip)) / POINTS
         self.immersed = length * float(spans.sum())
 
@@ -276,6 +289,7 @@ class Blade:
 
     def confirm_sweep(self) -> None:
         """Start the next sweep from the present edge."""
+        self._confirmed = self.paid
         self._before = (self._cut_tip - self._tip, self._cut_edge, self._back)
         self._cut_tip = self._tip.copy()
         self._cut_edge = self._edge.copy()

@@ -5,6 +5,14 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.contact.facing import (
+    Held,
+    across,
+    dot,
+    hold,
+    settled,
+    to_edge,
+)
 from cutting_trainer.tissue_sim.contact.fracture import (
     BLADE_THICKNESS,
     KNOTS,
@@ -71,20 +79,6 @@ class Tissue(NamedTuple):
     opened: np.ndarray
 
 
-class Law(NamedTuple):
-    """Constants of the law.
-
-    Attributes:
-        stiffness: of the spring of a point, for each piece that it stands for [N/m].
-        toughness: [J/m^2].
-        friction: per length [N/m].
-    """
-
-    stiffness: float
-    toughness: float
-    friction: float
-
-
 class Pull(NamedTuple):
     """How the device pulls the edge.
 
@@ -96,6 +90,7 @@ class Pull(NamedTuple):
         line: lag of the tip, and how much more the root lags [m], shape (2, 3).
         lag: mean distance in the tissue [m].
         paid, rubbed: work of cutting and of friction [J].
+        held: whether spine or flat carry tissue along anywhere.
     """
 
     force: np.ndarray
@@ -106,12 +101,13 @@ class Pull(NamedTuple):
     lag: float
     paid: float
     rubbed: float
+    held: bool
 
 
 @inner
 def no_pull(paid, rubbed):
     """Return the `Pull` of an edge in the air, with the works so far [J]."""
-    return Pull(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros((2, 3)), 0.0, paid, rubbed)
+    return Pull(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros((2, 3)), 0.0, paid, rubbed, False)
 
 
 @kernel
@@ -130,14 +126,16 @@ def follow_device(edge, strips, device, moved, tissue, law):
     _lag_behind(edge, device)
     _immerse(edge, device, tissue)
     paid, rubbed, limit = 0.0, 0.0, -1.0
+    facing = across(law.facing, direction)
     if not edge.spans.any():
         strips.counts[:] = 0
         return no_pull(paid, rubbed)
     low, high = _box(edge, device)
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
     fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
+    blade = Held(direction, facing, piece, np.zeros(POINTS))
     for _ in range(_MAX_SLIPS):
-        limit, cut, rub = _slip(edge, strips, device, faces, direction, piece, law, fresh, limits)
+        limit, cut, rub = _slip(edge, strips, device, faces, blade, law, fresh, limits)
         paid, rubbed = paid + cut, rubbed + rub
         if limit >= 0.0:
             break
@@ -146,18 +144,24 @@ def follow_device(edge, strips, device, moved, tissue, law):
             break
     ways, arms = device - edge.points, SHARES * (POINTS * piece)
     if limit < 0.0:
-        _resist(edge, ways.copy(), faces, direction, piece, law, fresh, limits)
+        _resist(edge, ways.copy(), faces, blade, law, fresh, limits)
+    held = hold(edge, ways, blade, law, limits)
     limit, torque_limit = limits.sum(), (limits * arms).sum()
     # As it is pulled now, or will be if the device moves on.
-    _resist(edge, moved.copy(), faces, direction, piece, law, fresh, limits)
+    _resist(edge, moved.copy(), faces, blade, law, fresh, limits)
+    hold(edge, ways, blade, law, limits)
     limit, torque_limit = max(limit, limits.sum()), max(torque_limit, (limits * arms).sum())
     force, torque = np.zeros(3), np.zeros(3)
     for i in range(POINTS):
         pull = law.stiffness * edge.spans[i] * ways[i]
+        back = dot(ways[i], facing)
+        if back < 0.0:
+            pull += edge.spans[i] * settled(-back, piece, law) * facing
         force += pull
         torque += np.cross(arms[i] * direction, pull)
     line, mean = _line(edge.spans, ways)
-    return Pull(force, torque, limit, torque_limit, line, np.sqrt((mean**2).sum()), paid, rubbed)
+    lag = np.sqrt((mean**2).sum())
+    return Pull(force, torque, limit, torque_limit, line, lag, paid, rubbed, held)
 
 
 @kernel
@@ -194,7 +198,7 @@ def carry_edge(edge, strips, device, moved, positions, law):
         sliced, pushed = _split(moved[i], direction)
         ratio = sliced / pushed if pushed > 0.0 else 0.0
         most = max(max(held, grip), ratio * pulled)
-        stretch = _dot(device[i] - carried, direction)
+        stretch = dot(device[i] - carried, direction)
         kept = min(max(stretch, -most), most)
         rubbed += 0.5 * law.stiffness * edge.spans[i] * (stretch**2 - kept**2)
         ways[i] = carried - edge.points[i]
@@ -203,7 +207,7 @@ def carry_edge(edge, strips, device, moved, positions, law):
     for k in range(KNOTS):
         share = min(max(SHARES[_KNOTS[k]], SHARES[first]), SHARES[last])
         way = line[0] + share * line[1]
-        way -= _dot(way, direction) * direction
+        way -= dot(way, direction) * direction
         for s in range(strips.counts[0]):
             for c in range(3):
                 strips.knots[s, 0, k, c] += way[c]
@@ -237,23 +241,18 @@ def gather_loads(edge, loads):
 
 
 @inner
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inner
 def _split(way, direction):
     """Return the lengths of a way along a direction and across it [m]."""
-    along = _dot(way, direction)
+    along = dot(way, direction)
     across = way - along * direction
-    return abs(along), np.sqrt(_dot(across, across))
+    return abs(along), np.sqrt(dot(across, across))
 
 
 @inner
 def _direction(device):
     """Return the unit vector from tip to root, and the length that a point stands for [m]."""
     edge = device[POINTS - 1] - device[0]
-    length = np.sqrt(_dot(edge, edge))
+    length = np.sqrt(dot(edge, edge))
     return edge / length, length / (POINTS - 1)
 
 
@@ -347,7 +346,7 @@ def _go_to_tissue(edge, device, tissue, found):
     """Move an edge in the air to where it meets tissue on its way to the device's."""
     ways, longest = device - edge.points, 0.0
     for i in range(POINTS):
-        longest = max(longest, _dot(ways[i], ways[i]))
+        longest = max(longest, dot(ways[i], ways[i]))
     steps = min(int(np.ceil(np.sqrt(longest) / (BLADE_THICKNESS / 2))), _MAX_STEPS)
     for step in range(1, steps + 1):
         edge.points[:] = device - (1.0 - step / steps) * ways
@@ -422,26 +421,26 @@ def _knots(edge, device):
 
 
 @inner
-def _slip(edge, strips, device, faces, direction, piece, law, fresh, limits):
+def _slip(edge, strips, device, faces, blade, law, fresh, limits):
     """Let the points slip whose springs exceed the resistance.
 
     Args:
         edge: `Edge`, changed.
         strips: `Strips`, changed.
         device: points of the device's edge [m], shape (POINTS, 3).
-        faces, direction, piece, law, fresh, limits: see `_resist`; before the slip.
+        faces, blade, law, fresh, limits: see `_resist`; before the slip.
 
     Returns:
         The largest force that the edge transmits as it is pulled [N], -1 where a point slipped;
         the work of cutting and that of friction [J].
     """
     slid, ways = np.zeros(POINTS), device - edge.points
-    _resist(edge, ways, faces, direction, piece, law, fresh, limits)
+    _resist(edge, ways, faces, blade, law, fresh, limits)
     cutting = False
     for i in range(POINTS):
         if edge.spans[i] == 0.0:
             continue
-        size = max(np.sqrt(_dot(ways[i], ways[i])), _TINY)
+        size = max(np.sqrt(dot(ways[i], ways[i])), _TINY)
         slid[i] = max(size - limits[i] / (law.stiffness * edge.spans[i]), 0.0)
         if not fresh[i]:
             slid[i] = min(slid[i], _MAX_FREE_SLIP)
@@ -454,7 +453,7 @@ def _slip(edge, strips, device, faces, direction, piece, law, fresh, limits):
     for i in range(POINTS):
         if edge.spans[i] > 0.0:
             work += limits[i] * slid[i]
-            rub += law.friction * piece * edge.spans[i] * slid[i]
+            rub += law.friction * blade.piece * edge.spans[i] * slid[i]
             edge.points[i] += ways[i]
     _lag_behind(edge, device)
     if cutting:
@@ -465,32 +464,35 @@ def _slip(edge, strips, device, faces, direction, piece, law, fresh, limits):
 
 
 @inner
-def _resist(edge, ways, faces, direction, piece, law, fresh, limits):
+def _resist(edge, ways, faces, blade, law, fresh, limits):
     """Find which points meet uncut tissue, and the largest force of each piece of the edge.
 
-    The forces are J l sin(edge, way) + friction.
+    The forces are J l sin(edge, way) + friction, along the ways on which the edge can cut.
 
     Args:
         edge: `Edge`.
-        ways: along which the points are pulled [m]; changed as by `look_ahead`, (POINTS, 3).
+        ways: along which the points are pulled [m]; changed as by `look_ahead` and `to_edge`,
+            (POINTS, 3).
         faces: `CutFaces`.
-        direction: unit vector along the edge, shape (3,).
-        piece: length that a point stands for [m].
+        blade: `Held`, of which `shares` change.
         law: `Law`.
         fresh: output, whether uncut tissue is ahead, shape (POINTS,).
         limits: output, forces [N], shape (POINTS,).
     """
-    e0, e1, e2 = direction[0], direction[1], direction[2]
+    e0, e1, e2 = blade.direction[0], blade.direction[1], blade.direction[2]
+    one_sided = blade.facing.any()
     for i in range(POINTS):
-        fresh[i], limits[i] = False, 0.0
+        fresh[i], limits[i], blade.shares[i] = False, 0.0, 0.0
         if edge.spans[i] == 0.0:
             continue
         fresh[i] = look_ahead(edge.points, ways, i, faces)
+        if one_sided and fresh[i]:
+            blade.shares[i] = to_edge(ways[i], blade)
         x, y, z = ways[i, 0], ways[i, 1], ways[i, 2]
         a, b, c = y * e2 - z * e1, z * e0 - x * e2, x * e1 - y * e0
         sine = np.sqrt(a * a + b * b + c * c) / max(np.sqrt(x * x + y * y + z * z), _TINY)
         cutting = law.toughness * sine if fresh[i] else 0.0
-        limits[i] = piece * edge.spans[i] * (cutting + law.friction)
+        limits[i] = blade.piece * edge.spans[i] * (cutting + law.friction)
 
 
 @inner

@@ -13,7 +13,10 @@ from cutting_trainer.tissue_sim.contact.tool import (
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
-_VECTORS = ('weights', 'device', 'proxy', 'point', 'normal', 'blade_root', 'blade_tip')
+_VECTORS = (
+    *('weights', 'device', 'proxy', 'point', 'normal'),
+    *('blade_root', 'blade_tip', 'blade_facing'),
+)
 _MAX_COORDINATE = 10.0
 _MIN_STIFFNESS, _MAX_STIFFNESS, _MAX_RADIUS = 1.0, 1e5, 0.1
 """Coupling stiffness [N/m], of which a scene has a tenth at most; proxy radius [m]."""
@@ -46,6 +49,9 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
         if not (np.abs(values) <= _MAX_COORDINATE).all():  # a NaN is not
             text = f'{name} {values.tolist()} is not finite or beyond {_MAX_COORDINATE:g}'
             raise MessageError('not finite or too far', text)
+    if message.blade_facing.any() and abs(np.linalg.norm(message.blade_facing) - 1) > 1e-6:
+        text = f'blade_facing {message.blade_facing.tolist()} is neither a unit vector nor zero'
+        raise MessageError('no unit vector', text)
     if not _MIN_STIFFNESS <= message.coupling_stiffness <= _MAX_STIFFNESS:
         stiffness, range_ = (
             message.coupling_stiffness,
@@ -92,6 +98,7 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
         sequence=message.sequence,
         external=message.external_force,
         mode=ToolMode(message.mode),
+        blade_facing=message.blade_facing,
     )
 
 

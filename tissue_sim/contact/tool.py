@@ -61,6 +61,8 @@ class ToolContact:
         external: force of the tool on the tissue as the bridge has it [N], shape (3,); the
             simulation takes from it whether the tool slides.
         mode: kind of the tool. A blade that is in the tissue stays there.
+        blade_facing: unit vector across the blade, from its spine to its edge; zero: it cuts all
+            round, shape (3,).
     """
 
     state: ContactState
@@ -77,6 +79,7 @@ class ToolContact:
     sequence: int = 0
     external: np.ndarray = field(default_factory=lambda: np.zeros(3))
     mode: ToolMode = ToolMode.SCALPEL
+    blade_facing: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def indenter_contact(

@@ -1,5 +1,6 @@
 """Constants of linear isotropic elasticity for the kernels."""
 
+import math
 from dataclasses import dataclass
 
 
@@ -41,3 +42,11 @@ class Material:
     def plane_modulus(self) -> float:
         """Modulus of contact, E / (1 - nu^2) [Pa]."""
         return self.youngs_modulus / (1 - self.poissons_ratio**2)
+
+    @property
+    def line_compliance(self) -> float:
+        """Displacement by a load along a line, by load per length and logarithm of the distance
+        from the line (Kelvin's solution, plane strain) [m^2/N].
+        """
+        nu = self.poissons_ratio
+        return (3 - 4 * nu) * (1 + nu) / (4 * math.pi * self.youngs_modulus * (1 - nu))

@@ -219,6 +219,7 @@ class TissueSimulation:
             self._blade,
             positions,
             self._frame_time,
+            self.material.line_compliance,
         )
 
     def _pushed_by(self, contact: ToolContact, positions: np.ndarray) -> Coupling:

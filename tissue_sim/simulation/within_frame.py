@@ -29,6 +29,7 @@ class ToolInFrame:
         blade: in the tissue; None: it is outside.
         positions: nodes at the begin of the frame [m], shape (n, 3).
         frame_time: [s].
+        line_compliance: of the tissue, see `Material.line_compliance` [m^2/N].
 
     Attributes:
         blade: at present; None: outside.
@@ -46,10 +47,12 @@ class ToolInFrame:
         blade: Blade | None,
         positions: np.ndarray,
         frame_time: float,
+        line_compliance: float,
     ) -> None:
         self._mesh, self._resistance, self._contact = mesh, resistance, contact
         self._way = before, np.array([contact.blade_root, contact.blade_tip])
         self._pushing = pushing
+        self._line_compliance = line_compliance
         self._near = NearElements(mesh.tetrahedra)
         self._opened = mesh.triangles[mesh.triangle_kind == CUT]
         self._positions = positions
@@ -77,7 +80,7 @@ class ToolInFrame:
         if self.blade is None and self._punctures(share, positions):
             hint = int(self._mesh.star(int(self._contact.nodes[0]))[0])
             root, tip = self._device(share)
-            self.blade = Blade(self._resistance, root, tip, hint)
+            self.blade = Blade(self._resistance, root, tip, hint, self._line_compliance)
         if self.blade is not None:
             self.blade.carry(positions)
             self._follow(share, positions)
@@ -93,9 +96,11 @@ class ToolInFrame:
 
     def _follow(self, share: float, positions: np.ndarray) -> None:
         assert self.blade is not None
-        stiffness = self._contact.stiffness
+        stiffness, facing = self._contact.stiffness, self._contact.blade_facing
         device, moved = self._device(share), (self._way[1] - self._way[0]) / self.parts
-        self.blade.follow(self._mesh, self._near, self._opened, positions, device, moved, stiffness)
+        self.blade.follow(
+            self._mesh, self._near, self._opened, positions, device, moved, stiffness, facing
+        )
         self.coupling = self.blade.spring(positions, self._way[1], share, stiffness)
 
     def _device(self, share: float) -> np.ndarray:

@@ -1,0 +1,147 @@
+"""Kernels of a blade whose edge faces one way: spine and flat carry the tissue along, uncut."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cutting_trainer.node_common.kernels import inner
+
+_TINY = 1e-300
+BLADE_HEIGHT = 5e-3
+"""[m] of a scalpel's blade from its edge to its spine."""
+_HELD_REACH = 5e-3
+"""[m] by which a hand may go on before the largest force of spine and flat is known anew."""
+_HELD_SHARE = 0.5
+"""Share of a pull against spine or flat above which the blade counts as held."""
+_MIN_ACROSS = 1e-3
+"""Sine of the angle between edge and facing below which the facing is not believed."""
+
+
+class Law(NamedTuple):
+    """Constants of the law.
+
+    Attributes:
+        stiffness: of the spring of a point, for each piece that it stands for [N/m].
+        toughness: [J/m^2].
+        friction: per length [N/m].
+        facing: unit vector from the blade's spine to its edge; zero: it cuts all round, shape (3,).
+        compliance: by which the spine goes deeper into the tissue than the flat would, by load per
+            length [m^2/N].
+    """
+
+    stiffness: float
+    toughness: float
+    friction: float
+    facing: np.ndarray
+    compliance: float
+
+
+class Held(NamedTuple):
+    """The blade as it is held, and what it carries along.
+
+    Attributes:
+        direction: unit vector from tip to root, shape (3,).
+        facing: unit vector across it, from spine to edge; zero: it cuts all round, shape (3,).
+        piece: length that a point stands for [m].
+        shares: of the pull of each point that is against spine or flat, shape (p,).
+    """
+
+    direction: np.ndarray
+    facing: np.ndarray
+    piece: float
+    shares: np.ndarray
+
+
+@inner
+def across(facing, direction):
+    """Return the unit vector across a direction nearest to a facing; zero: there is none."""
+    part = facing - dot(facing, direction) * direction
+    size = np.sqrt(dot(part, part))
+    if size < _MIN_ACROSS:
+        return np.zeros(3)
+    return part / size
+
+
+@inner
+def hold(edge, ways, blade, law, limits):
+    """Add to the largest forces those of spine and flat, by which nothing yields.
+
+    Args:
+        edge: `Edge`.
+        ways: from the edge to the device's [m], shape (p, 3).
+        blade: `Held`.
+        law: `Law`.
+        limits: changed, forces [N], shape (p,).
+
+    Returns:
+        Whether they carry tissue along anywhere.
+    """
+    held = False
+    for i in range(len(limits)):
+        if blade.shares[i] > 0.0:
+            stretch = np.sqrt(dot(ways[i], ways[i])) + _HELD_REACH
+            limits[i] += law.stiffness * edge.spans[i] * blade.shares[i] * stretch
+            held = held or blade.shares[i] > _HELD_SHARE
+    return held
+
+
+@inner
+def settled(stretch, piece, law):
+    """Return by how much force of a spring falls, because the spine is narrower than the flat.
+
+    The load of the flat is as wide as the elements at a blade are: the mesh knows its settlement.
+    That of the spine is deeper by a = compliance / l at first, and by its bound D at last: the
+    force f of the spring k is that of k (s - D a f / (D + a f)).
+
+    Args:
+        stretch: s, towards the spine, above 0 [m].
+        piece: length l of the edge [m].
+        law: `Law`.
+    """
+    k, a, most = law.stiffness, law.compliance / piece, BLADE_HEIGHT / 4
+    b = most + k * a * (most - stretch)
+    root = np.sqrt(b * b + 4.0 * a * k * stretch * most)
+    # Without cancellation, from a = 0 on.
+    force = 2.0 * k * stretch * most / (b + root)
+    return k * stretch - force
+
+
+@inner
+def to_edge(way, blade):
+    """Replace the way on which a point is pulled by that on which the edge can go.
+
+    Across the edge it is towards the edge alone, or aside by as much as it is pulled aside, where
+    that is little. Spine and flat do not cut: what is left of the way, the tissue is carried along.
+
+    Args:
+        way: [m]; changed, shape (3,).
+        blade: `Held`.
+
+    Returns:
+        Share of the way that is left.
+    """
+    whole = dot(way, way)
+    along, ahead = dot(way, blade.direction), dot(way, blade.facing)
+    aside = max(whole - along * along - ahead * ahead, 0.0)
+    kept, part = along * along, 0.0
+    if ahead > 0.0:
+        part = max(1.0 - aside / (ahead * ahead), 0.0)
+        kept += ahead * ahead + part * aside
+    else:
+        ahead = 0.0
+    square = along * along + ahead * ahead + part * part * aside
+    scale = kept / max(square, _TINY)
+    whole_ahead, left = dot(way, blade.facing), 0.0
+    for c in range(3):
+        onward = along * blade.direction[c] + ahead * blade.facing[c]
+        beside = way[c] - along * blade.direction[c] - whole_ahead * blade.facing[c]
+        after = scale * (onward + part * beside)
+        left += (way[c] - after) ** 2
+        way[c] = after
+    return np.sqrt(left / max(whole, _TINY))
+
+
+@inner
+def dot(a, b):
+    """Return the scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
