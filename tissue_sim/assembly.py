@@ -59,7 +59,7 @@ def make_task(settings: TissueSettings, mesh: TetMesh | None = None) -> Task:
         Material(
             m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta, m.stiffening, m.prony
         ),
-        Resistance(settings.cut_threshold, m.toughness, m.blade_friction),
+        Resistance(settings.cut_threshold, m.toughness, m.blade_friction, settings.tip_width),
         settings.budget,
         TimeStepping(
             settings.integrator,

@@ -261,7 +261,16 @@ class TissueSettings(SceneModel):
         default=0.5,
         gt=0,
         le=100,
-        description='contact force that lets the blade in [N], above 0 to 100',
+        description='contact force that lets the blade in, unless tip_width does [N], above 0 to '
+        '100',
+    )
+    tip_width: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.01,
+        description='width w of the slit that the tip of the blade opens: it goes in where the '
+        'work of the dent reaches toughness times w times its depth, and then resists by toughness '
+        'times w; 0: it goes in by cut_threshold, and its tip resists by nothing [m], 0 to 0.01',
     )
     method: Literal['given', 'auto'] = Field(
         default='given',

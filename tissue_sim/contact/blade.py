@@ -62,11 +62,14 @@ class Resistance:
         threshold: contact force at which the blade enters [N] (thesis 5.1).
         toughness: fracture toughness J [J/m^2].
         friction: per immersed length [N/m].
+        tip_width: of the slit that the tip opens [m]; 0: the blade enters by `threshold`, and its
+            tip resists by nothing.
     """
 
     threshold: float
     toughness: float
     friction: float
+    tip_width: float = 0.0
 
 
 class Turning(NamedTuple):
@@ -115,7 +118,8 @@ class Blade:
         line_compliance: float = 0.0,
     ) -> None:
         spine = float(line_compliance * np.log(BLADE_HEIGHT / BLADE_THICKNESS))
-        self._law = Law(1.0, resistance.toughness, resistance.friction, np.zeros(3), spine)
+        at_tip = resistance.toughness * resistance.tip_width
+        self._law = Law(1.0, resistance.toughness, resistance.friction, np.zeros(3), spine, at_tip)
         self._device = np.array([root, tip])
         self._moved = np.zeros((POINTS, 3))
         self._state = Edge(

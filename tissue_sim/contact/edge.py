@@ -39,6 +39,8 @@ _MAX_FREE_SLIP = BLADE_THICKNESS / 2
 """[m] by which the edge slips along a cut before what is ahead of it is looked up again."""
 _SETTLED = 1e-6
 """[m] of slip below which the edge counts as at rest."""
+_BEYOND = 1e-5
+"""[m] beyond the end of the edge, where the tip looks for uncut tissue."""
 _MIN_POINTS = 4
 """Points in the tissue from which on they tell the direction of the edge."""
 _TINY = 1e-300
@@ -168,9 +170,9 @@ def follow_device(edge, strips, device, moved, tissue, law):
 def carry_edge(edge, strips, device, moved, positions, law):
     """Move the edge with the tissue.
 
-    The edge is rigid: tissue that slides along it takes it along by no more than friction does, or
-    a hand that slices (Atkins). Else the tissue that heaps up before a blade would lift the edge
-    out.
+    The edge is rigid: tissue that slides along it takes it along by no more than friction and tip
+    do, or a hand that slices (Atkins). Else the tissue that heaps up before a blade would lift the
+    edge out.
 
     Args:
         edge: `Edge`, changed.
@@ -185,6 +187,9 @@ def carry_edge(edge, strips, device, moved, positions, law):
     """
     direction, piece = _direction(device)
     grip = law.friction * piece / law.stiffness
+    deeper = 0.0
+    if edge.spans[0] > 0.0:
+        deeper = law.at_tip / edge.spans.sum() / law.stiffness
     ways, rubbed, first, last = np.zeros((POINTS, 3)), 0.0, -1, 0
     for i in range(POINTS):
         if edge.spans[i] == 0.0:
@@ -199,7 +204,7 @@ def carry_edge(edge, strips, device, moved, positions, law):
         ratio = sliced / pushed if pushed > 0.0 else 0.0
         most = max(max(held, grip), ratio * pulled)
         stretch = dot(device[i] - carried, direction)
-        kept = min(max(stretch, -most), most)
+        kept = min(max(stretch, -max(most, grip + deeper)), most)
         rubbed += 0.5 * law.stiffness * edge.spans[i] * (stretch**2 - kept**2)
         ways[i] = carried - edge.points[i]
         edge.points[i] = carried + (stretch - kept) * direction
@@ -467,7 +472,8 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits):
 def _resist(edge, ways, faces, blade, law, fresh, limits):
     """Find which points meet uncut tissue, and the largest force of each piece of the edge.
 
-    The forces are J l sin(edge, way) + friction, along the ways on which the edge can cut.
+    The forces are J l sin(edge, way) + friction, along the ways on which the edge can cut. All
+    points in the tissue share the resistance of the tip to going deeper: the edge is rigid.
 
     Args:
         edge: `Edge`.
@@ -481,6 +487,9 @@ def _resist(edge, ways, faces, blade, law, fresh, limits):
     """
     e0, e1, e2 = blade.direction[0], blade.direction[1], blade.direction[2]
     one_sided = blade.facing.any()
+    at_tip = 0.0
+    if law.at_tip > 0.0 and edge.spans[0] > 0.0 and _is_tip_fresh(edge, blade, faces):
+        at_tip = law.at_tip / edge.spans.sum()
     for i in range(POINTS):
         fresh[i], limits[i], blade.shares[i] = False, 0.0, 0.0
         if edge.spans[i] == 0.0:
@@ -493,6 +502,18 @@ def _resist(edge, ways, faces, blade, law, fresh, limits):
         sine = np.sqrt(a * a + b * b + c * c) / max(np.sqrt(x * x + y * y + z * z), _TINY)
         cutting = law.toughness * sine if fresh[i] else 0.0
         limits[i] = blade.piece * edge.spans[i] * (cutting + law.friction)
+        if at_tip > 0.0:
+            deeper = -(x * e0 + y * e1 + z * e2) / max(np.sqrt(x * x + y * y + z * z), _TINY)
+            limits[i] += at_tip * edge.spans[i] * max(deeper, 0.0)
+
+
+@inner
+def _is_tip_fresh(edge, blade, faces):
+    """Return whether uncut tissue is ahead of the tip, beyond the half piece that strips have."""
+    before, way = np.empty((1, 3)), np.empty((1, 3))
+    before[0] = edge.points[0] - (blade.piece / 2 + _BEYOND) * blade.direction
+    way[0] = -blade.direction
+    return look_ahead(before, way, 0, faces)
 
 
 @inner

@@ -27,6 +27,7 @@ class Law(NamedTuple):
         facing: unit vector from the blade's spine to its edge; zero: it cuts all round, shape (3,).
         compliance: by which the spine goes deeper into the tissue than the flat would, by load per
             length [m^2/N].
+        at_tip: resistance of the tip to going deeper along the blade [N].
     """
 
     stiffness: float
@@ -34,6 +35,7 @@ class Law(NamedTuple):
     friction: float
     facing: np.ndarray
     compliance: float
+    at_tip: float
 
 
 class Held(NamedTuple):

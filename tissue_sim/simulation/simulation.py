@@ -21,7 +21,7 @@ from cutting_trainer.tissue_sim.simulation.local_stiffness import (
     ContactStiffness,
     GrippingStiffness,
 )
-from cutting_trainer.tissue_sim.simulation.within_frame import ToolInFrame
+from cutting_trainer.tissue_sim.simulation.within_frame import Dent, ToolInFrame
 
 
 class TissueSimulation:
@@ -75,6 +75,7 @@ class TissueSimulation:
             told = GrippingStiffness
         self._stiffness = told(self.dynamics, self._springs)
         self._pressed = 0.0
+        self._dent = Dent()
         self._blade: Blade | None = None
         self._target: np.ndarray | None = None
         self._device: np.ndarray | None = None
@@ -141,6 +142,7 @@ class TissueSimulation:
         motion = self.dynamics.advance(coupling, tool)
         if tool is not None:
             self._blade, coupling = tool.blade, tool.coupling
+        self._dent = Dent() if tool is None else tool.dent
         pressed = self._push_of(coupling)
         self._pressed = footprint_force(self._pressed, pressed)
         self._springs.end_frame(coupling, self.displacement, pressed)
@@ -220,6 +222,7 @@ class TissueSimulation:
             positions,
             self._frame_time,
             self.material.line_compliance,
+            self._dent if pushing.mode == PUSH else Dent(),
         )
 
     def _pushed_by(self, contact: ToolContact, positions: np.ndarray) -> Coupling:

@@ -49,7 +49,7 @@ from cutting_trainer.tissue_sim.motion import (
 )
 from cutting_trainer.tissue_sim.motion import divergence as guard
 from cutting_trainer.tissue_sim.simulation import local_stiffness as contact_stiffness
-from cutting_trainer.tissue_sim.simulation import simulation
+from cutting_trainer.tissue_sim.simulation import simulation, within_frame
 from cutting_trainer.tissue_sim.simulation.serialisation import (
     ObjectState,
     capture,
@@ -96,6 +96,7 @@ _MODULES = (
     tool_spring,
     topology,
     viscosity,
+    within_frame,
 )
 MESH_CLASSES = classes_of((mesh, topology))
 _CLASSES = classes_of(_MODULES)

@@ -4,6 +4,8 @@ At 30 Hz a hand moves the blade by millimetres in a frame. Evaluated once, the b
 late, cut late, and hold on to tissue that it has left.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance
@@ -15,6 +17,29 @@ from cutting_trainer.tissue_sim.mesh.topology import CUT
 
 _PERIOD_S = 5.6e-3
 """[s] Longest time between two evaluations: six in a frame of 30 Hz."""
+
+
+class Dent(NamedTuple):
+    """What the tool has done to the surface since it touched it.
+
+    Attributes:
+        force: of the tool [N].
+        place: of its tip into the tissue, without the stretch of the coupling [m].
+        depth: from where it touched [m].
+        work: on the tissue [J].
+    """
+
+    force: float = 0.0
+    place: float = 0.0
+    depth: float = 0.0
+    work: float = 0.0
+
+    def deepened(self, force: float, place: float) -> 'Dent':
+        """Return the dent at another force [N] and place [m]."""
+        if force <= 0.0 or self.force <= 0.0:
+            return Dent(force, place)
+        way = place - self.place
+        return Dent(force, place, self.depth + way, self.work + (force + self.force) / 2 * way)
 
 
 class ToolInFrame:
@@ -30,8 +55,10 @@ class ToolInFrame:
         positions: nodes at the begin of the frame [m], shape (n, 3).
         frame_time: [s].
         line_compliance: of the tissue, see `Material.line_compliance` [m^2/N].
+        dent: of the tool on the surface at the begin of the frame.
 
     Attributes:
+        dent: at present.
         blade: at present; None: outside.
         coupling: the spring at present.
         parts: of the frame, in each of which there is one spring.
@@ -48,11 +75,13 @@ class ToolInFrame:
         positions: np.ndarray,
         frame_time: float,
         line_compliance: float,
+        dent: Dent,
     ) -> None:
         self._mesh, self._resistance, self._contact = mesh, resistance, contact
         self._way = before, np.array([contact.blade_root, contact.blade_tip])
         self._pushing = pushing
         self._line_compliance = line_compliance
+        self._first_dent = self.dent = dent
         self._near = NearElements(mesh.tetrahedra)
         self._opened = mesh.triangles[mesh.triangle_kind == CUT]
         self._positions = positions
@@ -63,7 +92,7 @@ class ToolInFrame:
 
     def restart(self) -> Coupling:
         """Return to the begin of the frame, and the spring of its first part."""
-        self.blade, self.coupling = None, self._pushing
+        self.blade, self.coupling, self.dent = None, self._pushing, self._first_dent
         if self._kept is not None:
             self.blade, kept = self._kept
             self.blade.restore(kept)
@@ -92,7 +121,12 @@ class ToolInFrame:
         if spring.mode != PUSH or self._contact.mode == ToolMode.PALPATOR:
             return False
         pressed = float(np.linalg.norm(spring.force(positions, share)))
-        return pressed >= self._resistance.threshold
+        at_tip = self._resistance.toughness * self._resistance.tip_width
+        if at_tip == 0.0:
+            return pressed >= self._resistance.threshold
+        tip = -float(self._device(share)[1] @ spring.normal)
+        self.dent = self.dent.deepened(pressed, tip - pressed / self._contact.stiffness)
+        return self.dent.work >= at_tip * self.dent.depth > 0.0
 
     def _follow(self, share: float, positions: np.ndarray) -> None:
         assert self.blade is not None
