@@ -59,7 +59,7 @@ class Resimulation:
     def _begin_anew(self) -> None:
         mesh = self.simulation.mesh
         self._method.abort()
-        self._mesh = TetMesh(mesh.rest, mesh.tetrahedra, mesh.fixed)
+        self._mesh = TetMesh(mesh.rest, mesh.tetrahedra, mesh.fixed, mesh.regions)
         self._mesh.topology = mesh.topology
         self._mesh.set_kinds(mesh.triangles, mesh.triangle_kind)
         self._outdated = False

@@ -29,7 +29,10 @@ def plan(
 @commands.command('import-mesh', epilog=EXIT_STATUSES)
 def import_mesh(
     surface: Annotated[
-        Path, typer.Argument(help='Closed surface: .stl, .ply, .obj or what else trimesh reads.')
+        Path,
+        typer.Argument(
+            help='Closed surface: .stl, .ply, .obj or what else trimesh reads; or tetrahedra.'
+        ),
     ],
     output: Annotated[
         Path,

@@ -302,6 +302,7 @@ def _delta(
         removed_tetrahedra=removed,
         tetrahedra=np.concatenate([patch.corners[:count], patch.corners[changed]]),
         outer_faces=np.concatenate([pieces.outer, outer]),
+        regions=mesh.regions_at(np.concatenate([tables.children[pieces.owners, 0], stayed])),
     )
 
 

@@ -2,7 +2,7 @@
 
 A front follows the elements, and ends up to half an edge short of the blade's end or beyond it. Its
 nodes slide in the rest shape to the nearest place on the path of the blade's end, as far as the
-elements around them stay well shaped.
+elements around them stay well shaped. Those between two regions of the tissue stay.
 """
 
 from dataclasses import replace
@@ -76,6 +76,8 @@ def slide_front(
     faces, pairs = _open_faces(local, place)
     own = local.nodes >= first_new
     own[np.searchsorted(local.nodes, np.intersect1d(nodes, local.nodes))] = True
+    if len(mesh.regions):
+        own &= ~_between_regions(mesh, delta, local)
     fronts = np.flatnonzero(_on_front(local, place, faces, pairs) & own)
     targets, distance = _nearest_on(_border(lines), local.rest[fronts])
     near = (distance < _FARTHEST * h) & (distance > 1e-3 * h)
@@ -124,6 +126,18 @@ def _on_front(local: Local, place: Ints, faces: Ints, pairs: Ints) -> NDArray[np
     single[pairs.ravel()] = False
     outer[corners[single]] = True
     return front & ~outer & (np.bincount(place)[place] == 1)
+
+
+def _between_regions(mesh: TetMesh, delta: TopologyDelta, local: Local) -> NDArray[np.bool_]:
+    """Return which nodes have elements of several regions, shape (j,)."""
+    region = np.empty(len(local.corners), np.uint8)
+    old = local.number >= 0
+    region[old] = mesh.regions[local.number[old]]
+    region[~old] = delta.regions[-1 - local.number[~old]]
+    least, most = np.full(len(local.nodes), 255), np.zeros(len(local.nodes), int)
+    np.minimum.at(least, local.corners, region[:, None])
+    np.maximum.at(most, local.corners, region[:, None])
+    return np.asarray(least < most)
 
 
 def _border(lines: Floats) -> Floats:

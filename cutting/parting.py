@@ -502,4 +502,5 @@ def _with_copies(
         removed_tetrahedra=np.sort(np.concatenate([delta.removed_tetrahedra, stayed]))[::-1],
         tetrahedra=np.concatenate([tetrahedra, corners[old]]),
         outer_faces=np.concatenate([delta.outer_faces, outer_bits_of(mesh.links, stayed)]),
+        regions=np.concatenate([delta.regions, mesh.regions_at(stayed)]),
     )

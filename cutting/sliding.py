@@ -5,7 +5,7 @@ import numpy as np
 from cutting_trainer.cutting.geometry import altitude, height
 from cutting_trainer.cutting.lookup import SNAPPED, base_of
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.tissue_sim.mesh.topology import CUT
+from cutting_trainer.tissue_sim.mesh.topology import CUT, FACE_NODES
 
 _MIN_ALTITUDE_LEFT = 0.4
 _FLAT = 1e-10
@@ -131,23 +131,33 @@ def _volume_gradient(star, rest, at, where, out):
 
 
 @inner
-def _surface_normals(node, links, rest, at, where):
-    """Return unit normals of the surface triangles at a node, then 1 for an earlier cut, shape (k,
-    4).
+def _parts_regions(links, tet, face):
+    """Return whether a face leads to a region of a higher number: one of two does."""
+    if links.region.shape[0] == 0 or links.neighbors[tet, face] < 0:
+        return False
+    return links.region[links.neighbors[tet, face] // 4] > links.region[tet]
 
-    Nodes that have a row in `at` lie at that row of `where`.
+
+@inner
+def _surface_normals(node, links, rest, at, where):
+    """Return unit normals of the triangles at a node that keep their shape, shape (k, 4).
+
+    They are those of the surface, then 0, those of an earlier cut, then 1, and those between two
+    regions, then 2. Nodes that have a row in `at` lie at that row of `where`.
     """
     first_corner, corner_next, face_triangle = (
         links.first_corner,
         links.corner_next,
         links.face_triangle,
     )
-    triangles, kind = links.triangles, links.triangle_kind
+    kind = links.triangle_kind
     count = 0
     corner = first_corner[node]
     while corner >= 0:
         for face in range(4):
-            count += face != corner % 4 and face_triangle[corner // 4, face] >= 0
+            count += face != corner % 4 and (
+                face_triangle[corner // 4, face] >= 0 or _parts_regions(links, corner // 4, face)
+            )
         corner = corner_next[corner]
     normals = np.empty((count, 4))
     count = 0
@@ -155,11 +165,12 @@ def _surface_normals(node, links, rest, at, where):
     corner = first_corner[node]
     while corner >= 0:
         for face in range(4):
-            k = face_triangle[corner // 4, face]
-            if face != corner % 4 and k >= 0:
-                _put(a, triangles[k, 0], rest, at, where)
-                _put(b, triangles[k, 1], rest, at, where)
-                _put(c, triangles[k, 2], rest, at, where)
+            k, tet = face_triangle[corner // 4, face], corner // 4
+            between = _parts_regions(links, tet, face)
+            if face != corner % 4 and (k >= 0 or between):
+                _put(a, links.tetrahedra[tet, FACE_NODES[face, 0]], rest, at, where)
+                _put(b, links.tetrahedra[tet, FACE_NODES[face, 1]], rest, at, where)
+                _put(c, links.tetrahedra[tet, FACE_NODES[face, 2]], rest, at, where)
                 ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
                 vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
                 x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -169,7 +180,7 @@ def _surface_normals(node, links, rest, at, where):
                     y / size,
                     z / size,
                 )
-                normals[count, 3] = kind[k] == CUT
+                normals[count, 3] = 2.0 if between else 1.0 if kind[k] == CUT else 0.0
                 count += 1
         corner = corner_next[corner]
     return normals
@@ -216,7 +227,8 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
 
     Inside the tissue it is orthogonal to the swept surface. At the tissue's surface it lies in the
     tangent plane, and at an edge of the tissue along that edge. The end of an earlier cut, where
-    both cut faces meet, stays in place.
+    both cut faces meet, stays in place. Between two regions it lies in their common face, which
+    keeps its shape.
 
     Args:
         star: around the node, shape (s, 4).
@@ -254,6 +266,9 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
             across[0], across[1], across[2] = turn[0], turn[1], turn[2]
     inward, tangent = np.empty(3), np.empty(3)
     _volume_gradient(star, rest, at, where, inward)
+    if normals[:, 3].min() == 2.0:  # within the tissue, where volume does not change
+        for i in range(3):
+            inward[i] = -normals[:, i].sum()
     size = np.sqrt(_dot(inward, inward))
     share = _dot(inward, plane) / max(size * size, 1e-300)
     smooth = True

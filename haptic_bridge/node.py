@@ -388,10 +388,13 @@ def of_tissue(scene: Path) -> tuple[float, Friction]:
     unknown, and its friction.
     """
     try:
-        material = read_section(scene, 'tissue', TissueSettings).material
+        tissue = read_section(scene, 'tissue', TissueSettings)
     except SceneError:  # a scene for the device alone, or one that tissue_sim rejects
         return math.inf, NO_FRICTION
-    return material.toughness + material.blade_friction, material.dry_friction
+    m, of = tissue.material, tissue.region_values
+    pairs = zip(of('toughness'), of('blade_friction'), strict=True)
+    most = max(sum(pair) for pair in [(m.toughness, m.blade_friction), *pairs])
+    return most, m.dry_friction
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""`trainer import-mesh`: make a mesh and a scene from the surface of an organ."""
+"""`trainer import-mesh`: make a mesh and a scene from an organ's surface or tetrahedra."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from cutting_trainer.mesh_import.imported_scene import require_thick, scene_text
 from cutting_trainer.mesh_import.mesher import fill
 from cutting_trainer.mesh_import.surface_import import Surface, read_surface
+from cutting_trainer.mesh_import.volume_import import is_volume, read_volume
 from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
@@ -49,7 +50,7 @@ class ImportOptions:
     """Options of `import-mesh`.
 
     Attributes:
-        surface: file of the surface.
+        surface: file of the surface, or of tetrahedra, which stay as they are.
         output: name or path of the mesh and scene to write, without an extension.
         unit: unit of length of the file.
         edge: target edge length [m]; None: chosen for `DEFAULT_TETRAHEDRA`.
@@ -100,21 +101,33 @@ def import_mesh(options: ImportOptions) -> Status:
         SessionError: the surface, or a file to write, is not valid.
     """
     console = Console(stderr=True, soft_wrap=True)
+    labels = np.zeros(0, np.int64)
     if options.rests_on not in SIDES:
         raise SessionError(f'--rests-on {options.rests_on}: one of {", ".join(SIDES)}')
     mesh_file, scene_file = _files(options.output)
     with console.status(f'reading {options.surface}'):
-        surface = _placed(read_surface(options.surface, options.unit), options.rests_on)
+        if is_volume(options.surface):
+            solid = read_volume(options.surface, options.unit, options.edge)
+            nodes, tetrahedra, labels = solid.nodes, solid.tetrahedra, solid.labels
+            nodes = _placed(nodes, options.rests_on)
+            surface, edge = solid.surface(nodes), solid.edge
+        else:
+            surface = read_surface(options.surface, options.unit)
+            surface = replace(surface, vertices=_placed(surface.vertices, options.rests_on))
+            edge = _edge(surface, options.edge)
     require_thick(options.surface, surface.size)
-    edge = _edge(surface, options.edge)
-    with console.status(f'filling it with tetrahedra of {1e3 * edge:.2g} mm'):
-        nodes, tetrahedra = fill(surface.vertices, surface.triangles, edge, ENVELOPE_EDGES * edge)
-    nodes[:, 2] -= nodes[:, 2].min()
     given = _samples(surface)
-    _require_same_border(options.surface, given, nodes, tetrahedra, edge)
+    if not len(labels):
+        with console.status(f'filling it with tetrahedra of {1e3 * edge:.2g} mm'):
+            nodes, tetrahedra = fill(
+                surface.vertices, surface.triangles, edge, ENVELOPE_EDGES * edge
+            )
+        nodes[:, 2] -= nodes[:, 2].min()
+        _require_same_border(options.surface, given, nodes, tetrahedra, edge)
+        labels = np.ones(len(tetrahedra), np.int64)
     mesh_file.parent.mkdir(parents=True, exist_ok=True)
-    _write(mesh_file, nodes, tetrahedra)
-    text = scene_text(mesh_file.name, str(options.surface.name), nodes, tetrahedra, edge)
+    _write(mesh_file, nodes, tetrahedra, labels)
+    text = scene_text(mesh_file.name, str(options.surface.name), nodes, tetrahedra, edge, labels)
     scene_file.write_text(text, encoding='utf-8')
     try:
         with console.status('examining the mesh'):
@@ -125,8 +138,10 @@ def import_mesh(options: ImportOptions) -> Status:
     return Status.OK
 
 
-def _write(file: Path, nodes: Points, tetrahedra: NDArray[np.int32]) -> None:
-    tags = {f'gmsh:{kind}': [np.ones(len(tetrahedra), int)] for kind in ('physical', 'geometrical')}
+def _write(
+    file: Path, nodes: Points, tetrahedra: NDArray[np.int32], labels: NDArray[np.int64]
+) -> None:
+    tags = {f'gmsh:{kind}': [labels] for kind in ('physical', 'geometrical')}
     mesh = meshio.Mesh(nodes, [('tetra', tetrahedra)], cell_data=tags)
     mesh.write(file, file_format='gmsh22', binary=False, float_fmt='.9g')
 
@@ -144,16 +159,16 @@ def _files(output: Path) -> tuple[Path, Path]:
     return files
 
 
-def _placed(surface: Surface, rests_on: str) -> Surface:
-    """Rotate a surface so that `rests_on` is down; origin at the centre of the underside."""
+def _placed(points: Points, rests_on: str) -> Points:
+    """Rotate points so that `rests_on` is down; origin at the centre of the underside."""
     axis, sign = SIDES[rests_on]
     order = {2: [0, 1, 2], 1: [2, 0, 1], 0: [1, 2, 0]}[axis]
-    vertices = surface.vertices[:, order]
+    vertices = points[:, order]
     if sign < 0:  # half a turn about x
         vertices = vertices * [1, -1, -1]
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     origin = [*(low + high)[:2] / 2, low[2]]
-    return replace(surface, vertices=vertices - origin)
+    return np.asarray(vertices - origin)
 
 
 def _edge(surface: Surface, asked: float | None) -> float:

@@ -31,7 +31,7 @@ tissue:
     # Lower than measured, so that the tissue opens before it has yielded by centimetres.
     toughness: 10
     blade_friction: 2
-  damping: {{alpha: 15, beta: {beta:.2g}}}
+{regions}  damping: {{alpha: 15, beta: {beta:.2g}}}
   # Fixed nodes: the underside. Use boxes to fix other nodes.
   fixed:
     - below: {{axis: z, value: {held:.6g}}}
@@ -122,7 +122,12 @@ def require_thick(source: Path, size: Points) -> None:
 
 
 def scene_text(
-    mesh: str, source: str, nodes: Points, tetrahedra: NDArray[np.int32], edge: float
+    mesh: str,
+    source: str,
+    nodes: Points,
+    tetrahedra: NDArray[np.int32],
+    edge: float,
+    labels: NDArray[np.int64],
 ) -> str:
     """Return a scene that palpates the highest point and cuts along x across it.
 
@@ -132,6 +137,7 @@ def scene_text(
         nodes: [m], z up, the underside at 0, shape (n, 3).
         tetrahedra: shape (m, 4).
         edge: target edge length [m].
+        labels: of the tetrahedra, shape (m,).
     """
     size = np.ptp(nodes, axis=0)
     radius = min(MAX_TOOL_RADIUS_M, size.min() / 6)
@@ -151,6 +157,7 @@ def scene_text(
         nodes=len(nodes),
         tetrahedra=len(tetrahedra),
         edge=1e3 * edge,
+        regions=_regions(nodes, tetrahedra, labels),
         beta=DAMPING_PER_EDGE * edge,
         held=_held(nodes, edge),
         threshold=0.08 * radius / MAX_TOOL_RADIUS_M,
@@ -174,6 +181,16 @@ def scene_text(
         end=at(high, 8 * radius),
         deep=3.5e3 * radius,
     )
+
+
+def _regions(nodes: Points, tetrahedra: NDArray[np.int32], labels: NDArray[np.int64]) -> str:
+    """Return the regions of a scene, all but that of the highest place, which the tool touches."""
+    touched = labels[(tetrahedra == nodes[:, 2].argmax()).any(axis=1)][0]
+    others = [label for label in np.unique(labels) if label != touched]
+    if not others:
+        return ''
+    lines = [f'  regions:  # give each its own values; the label {touched} has those above']
+    return '\n'.join([*lines, *(f'    - {{label: {label}}}' for label in others), ''])
 
 
 def _held(nodes: Points, edge: float) -> float:

@@ -22,6 +22,24 @@ MAX_ATTEMPTS = 8
 """fTetWild is not deterministic: the mesh with the longest stable time step is kept."""
 
 
+PAD_SIZE_M = (0.06, 0.04)
+PAD_CELLS = (11, 7)
+PAD_HEIGHTS_M = (0.0, 0.006, 0.011, 0.014)
+"""Levels of nodes in the pad; the last layer is skin, the others are fat."""
+SKIN, FAT = 1, 2
+"""Labels of the pad's tetrahedra."""
+
+
+def pad() -> tuple[Points, NDArray[np.int32], NDArray[np.int32]]:
+    """Return a pad of skin on fat: nodes [m], shape (n, 3); tetrahedra and their labels."""
+    nodes, tetrahedra = block((*PAD_CELLS, len(PAD_HEIGHTS_M) - 1), 1.0)
+    layer = np.rint(nodes[:, 2]).astype(int)
+    nodes[:, :2] *= np.array(PAD_SIZE_M) / PAD_CELLS
+    nodes[:, 2] = np.array(PAD_HEIGHTS_M)[layer]
+    top = layer[tetrahedra].min(axis=1) == len(PAD_HEIGHTS_M) - 2
+    return nodes, tetrahedra, np.where(top, SKIN, FAT).astype(np.int32)
+
+
 def block(cells: tuple[int, int, int], size: float) -> tuple[Points, NDArray[np.int32]]:
     """Return a block of cubes, each split into six tetrahedra around its diagonal (Kuhn).
 
@@ -141,8 +159,15 @@ def _smooth_minimum(
     return np.minimum(a, b) - blend**2 * width / 4
 
 
-def _write(path: Path, nodes: Points, tetrahedra: NDArray[np.int32]) -> None:
-    mesh = meshio.Mesh(nodes, [('tetra', tetrahedra)])
+def _write(
+    path: Path,
+    nodes: Points,
+    tetrahedra: NDArray[np.int32],
+    labels: NDArray[np.int32] | None = None,
+) -> None:
+    names = () if labels is None else ('gmsh:physical', 'gmsh:geometrical')
+    tags = {name: [labels] for name in names}
+    mesh = meshio.Mesh(nodes, [('tetra', tetrahedra)], cell_data=tags)
     mesh.write(path, file_format='gmsh22', binary=False, float_fmt='.7g')
     print(f'{path}: {len(nodes)} nodes, {len(tetrahedra)} tetrahedra')
 
@@ -155,6 +180,7 @@ def main() -> None:
     _write(folder / 'block_yi2007.msh', *block((4, 4, 1), 0.01))
     _write(folder / 'slab.msh', *block((12, 12, 5), 0.008))
     _write(folder / 'flap.msh', *block((12, 5, 3), 0.01 / 3))
+    _write(folder / 'pad.msh', *pad())
     _write(folder / 'liver.msh', *organ())
 
 

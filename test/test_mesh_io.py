@@ -252,7 +252,7 @@ def test_the_error_of_a_scene_names_the_mesh_file(tmp_path):
     )
     with pytest.raises(MeshError, match=f'^{path}: .*tissue.unit: mm'):
         load_tissue(settings)
-    nodes, tetrahedra, fixed = load_tissue(settings.model_copy(update={'unit': 'mm'}))
+    nodes, tetrahedra, fixed, _ = load_tissue(settings.model_copy(update={'unit': 'mm'}))
     assert np.ptp(nodes) == pytest.approx(0.04)
     assert fixed.sum() == 9
 

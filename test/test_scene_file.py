@@ -202,13 +202,13 @@ def test_a_shipped_scene_is_complete_and_valid(scene):
     arm = read_section(scene, 'arm', ArmSettings)
     check_together(tool, device, haptics, device.load_profile())
     assert compile_script(arm.script, device.tissue_from_device).seconds == pytest.approx(20)
-    _, _, fixed = load_tissue(tissue)
+    _, _, fixed, _ = load_tissue(tissue)
     assert 10 < fixed.sum() <= len(fixed) / 2
 
 
 def height(scene: Path, x: float, y: float) -> float:
     """Largest z [m] of the scene's tissue above (x, y); minus infinity beside it."""
-    nodes, tetrahedra, _ = load_tissue(read_section(scene, 'tissue', TissueSettings))
+    nodes, tetrahedra, *_ = load_tissue(read_section(scene, 'tissue', TissueSettings))
     a, b, c = np.moveaxis(nodes[tetrahedra[:, FACES].reshape(-1, 3)], 1, 0)
     double = _cross(b - a, c - a)
     upright = np.abs(double) > 1e-12

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.tissue_sim.contact.blade import Resistance
-from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.material import Material, RegionMaterial
 from cutting_trainer.tissue_sim.mesh.checks import check_mesh, select_fixed
-from cutting_trainer.tissue_sim.mesh.files import load_mesh
+from cutting_trainer.tissue_sim.mesh.files import load_labelled_mesh
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
@@ -25,22 +25,37 @@ from cutting_trainer.tissue_sim.warm_up import warm_up, warm_up_method, warm_up_
 
 def load_tissue(
     settings: TissueSettings,
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.bool_], NDArray[np.uint8]]:
     """Read and check the mesh that a scene names.
 
     Returns:
-        nodes [m], shape (n, 3); tetrahedra, positively oriented, shape (m, 4); and which nodes do
-        not move, shape (n,).
+        nodes [m], shape (n, 3); tetrahedra, positively oriented, shape (m, 4); which nodes do not
+        move, shape (n,); and regions by tetrahedron, shape (m,), (0,) in a scene without regions.
 
     Raises:
         MeshError: one sentence with the file, the element or node, and the remedy.
     """
-    nodes, tetrahedra = load_mesh(settings.mesh, settings.unit_scale)
+    nodes, tetrahedra, labels = load_labelled_mesh(settings.mesh, settings.unit_scale)
     try:
         tetrahedra = check_mesh(nodes, tetrahedra)
-        return nodes, tetrahedra, select_fixed(nodes, tetrahedra, settings.fixed)
+        fixed = select_fixed(nodes, tetrahedra, settings.fixed)
+        return nodes, tetrahedra, fixed, _regions(settings, labels)
     except MeshError as error:
         raise MeshError(f'{settings.mesh}: {error}') from None
+
+
+def _regions(settings: TissueSettings, labels: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return the region by tetrahedron: 0, or its place in the scene's list, from 1."""
+    regions = np.zeros(len(labels) if settings.regions else 0, np.uint8)
+    for number, region in enumerate(settings.regions, start=1):
+        own = labels == region.label
+        if not own.any():
+            known = ', '.join(map(str, np.unique(labels)[:20]))
+            raise MeshError(
+                f'no tetrahedron has the label {region.label} of tissue.regions; there are {known}'
+            )
+        regions[own] = number
+    return regions
 
 
 def make_task(settings: TissueSettings, mesh: TetMesh | None = None) -> Task:
@@ -54,12 +69,28 @@ def make_task(settings: TissueSettings, mesh: TetMesh | None = None) -> Task:
         MeshError: the mesh is not valid.
     """
     m, d, i = settings.material, settings.damping, settings.integration
+    of = settings.region_values
+    stiffness = zip(of('youngs_modulus'), of('density'), strict=True)
+    resistance = zip(of('toughness'), of('blade_friction'), strict=True)
     return Task(
         mesh or TetMesh(*load_tissue(settings)),
         Material(
-            m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta, m.stiffening, m.prony
+            m.youngs_modulus,
+            m.poissons_ratio,
+            m.density,
+            d.alpha,
+            d.beta,
+            m.stiffening,
+            m.prony,
+            tuple(RegionMaterial(*constants) for constants in stiffness),
         ),
-        Resistance(settings.cut_threshold, m.toughness, m.blade_friction, settings.tip_width),
+        Resistance(
+            settings.cut_threshold,
+            m.toughness,
+            m.blade_friction,
+            settings.tip_width,
+            tuple(resistance),
+        ),
         settings.budget,
         TimeStepping(
             settings.integrator,

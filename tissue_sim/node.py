@@ -240,6 +240,9 @@ class TissueSimNode(ManagedNode):
         self._looked_at = mesh.topology
         for piece in self._pieces.find_new(mesh, simulation.positions):
             mass = piece.volume * simulation.material.density
+            if len(mesh.regions):
+                own = self._pieces.nodes_of(piece.number)
+                mass = float(simulation.model.mass[own].sum())
             self._free_pieces.publish(
                 messages.piece_message(piece, mass, frame.step, mesh.topology, time.time_ns())
             )

@@ -1,5 +1,6 @@
 """Section `tissue` of a scene file."""
 
+from collections.abc import Container
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -109,13 +110,56 @@ class MaterialSettings(SceneModel):
     @model_validator(mode='before')
     @classmethod
     def _fill_in_preset(cls, values: Any) -> Any:
-        preset = values.get('preset') if isinstance(values, dict) else None
-        if not isinstance(preset, str):
-            return values
-        if preset not in PRESETS:
-            known = ', '.join(map(repr, PRESETS))
-            raise ValueError(f'preset {preset!r} is not known: there are {known}')
-        return PRESETS[preset].values | values
+        return _with_preset(values, cls.model_fields)
+
+
+def _with_preset(values: Any, fields: Container[str]) -> Any:
+    """Return the values with those of their preset that are absent, as far as there are fields."""
+    preset = values.get('preset') if isinstance(values, dict) else None
+    if not isinstance(preset, str):
+        return values
+    if preset not in PRESETS:
+        known = ', '.join(map(repr, PRESETS))
+        raise ValueError(f'preset {preset!r} is not known: there are {known}')
+    return {k: v for k, v in PRESETS[preset].values.items() if k in fields} | values
+
+
+class RegionSettings(SceneModel):
+    """A region of the mesh with a material of its own; what is absent is as in `material`.
+
+    Poisson's ratio, stiffening, viscosity and dry friction are those of `material`, also beside a
+    preset.
+    """
+
+    label: int = Field(
+        ge=-(2**31),
+        lt=2**31,
+        description='number of its tetrahedra in the mesh file [-]: the physical group of Gmsh, '
+        'medit:ref, or cell data of the name region or label',
+    )
+    preset: PresetName | None = Field(
+        default=None, description='named material that fills in what is absent of the values below'
+    )
+    youngs_modulus: float | None = Field(
+        default=None, ge=10, le=1e7, description="Young's modulus [Pa], 10 to 1e7"
+    )
+    density: float | None = Field(
+        default=None, ge=100, le=20000, description='mass density [kg/m^3], 100 to 20000'
+    )
+    toughness: float | None = Field(
+        default=None, ge=0, le=1e5, description='fracture toughness [J/m^2], 0 to 1e5'
+    )
+    blade_friction: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e4,
+        description='friction on the blade by length of edge in the tissue [N/m], 0 to 1e4',
+    )
+
+    @model_validator(mode='before')
+    @classmethod
+    def _fill_in_preset(cls, values: Any) -> Any:
+        return _with_preset(values, cls.model_fields)
 
 
 class Damping(SceneModel):
@@ -243,6 +287,12 @@ class TissueSettings(SceneModel):
     material: MaterialSettings = Field(
         description='preset, or youngs_modulus, poissons_ratio and density'
     )
+    regions: tuple[RegionSettings, ...] = Field(
+        default=(),
+        max_length=32,
+        description='regions of the mesh with a material of their own, up to 32; others have '
+        '`material`, which should be that of the surface under the tool',
+    )
     damping: Damping = Field(default=Damping(), description='alpha [1/s] and beta [s]')
     fixed: tuple[FixedRegion, ...] = Field(
         min_length=1, description='regions whose nodes do not move, at least one'
@@ -305,6 +355,20 @@ class TissueSettings(SceneModel):
         default=Budget(),
         description='required range and accuracy of the method, and its allowed cost',
     )
+
+    @model_validator(mode='after')
+    def _check_regions(self) -> Self:
+        labels = [region.label for region in self.regions]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise ValueError(f'label {label} is in regions twice: name each region once')
+        return self
+
+    def region_values(self, name: str) -> list[float]:
+        """Return a constant of the regions, one after the other; absent: that of `material`."""
+        common = getattr(self.material, name)
+        given = [getattr(region, name) for region in self.regions]
+        return [common if value is None else value for value in given]
 
     @model_validator(mode='after')
     def _check_damping(self) -> Self:

@@ -67,7 +67,7 @@ class Markers:
         colouring: quantity that colours the tissue.
         largest: value of the last colour: displacement [m] or stress [Pa]; 0: 10 mm, or a tenth of
             Young's modulus.
-        youngs_modulus: [Pa], for stress.
+        youngs_modulus: by region [Pa], for stress, shape (1 + r,); a number: of all.
         poissons_ratio: the same.
     """
 
@@ -76,10 +76,10 @@ class Markers:
         frame: str,
         colouring: Colouring,
         largest: float,
-        youngs_modulus: float,
+        youngs_modulus: float | Floats,
         poissons_ratio: float,
     ) -> None:
-        usual = {'displacement': 0.01, 'von_mises': 0.1 * youngs_modulus}
+        usual = {'displacement': 0.01, 'von_mises': 0.1 * float(np.max(youngs_modulus))}
         self._frame, self._colouring = frame, colouring
         self._largest = largest or usual[colouring]
         self._elasticity = youngs_modulus, poissons_ratio
@@ -170,14 +170,16 @@ def shades(shares: Floats) -> NDArray[np.float32]:
     return _SHADES[(np.clip(shares, 0, 1) * (len(_SHADES) - 1)).astype(int)]
 
 
-def von_mises(replica: MeshReplica, youngs_modulus: float, poissons_ratio: float) -> Floats:
+def von_mises(
+    replica: MeshReplica, youngs_modulus: float | Floats, poissons_ratio: float
+) -> Floats:
     """Return the von Mises stress by node, averaged over its elements by volume [Pa], shape (n,).
 
     It uses Green's strain and Hooke's law (St. Venant-Kirchhoff), so that a rotation has no stress.
 
     Args:
         replica: of the tissue.
-        youngs_modulus: [Pa].
+        youngs_modulus: by region [Pa], shape (1 + r,); a number: of all.
         poissons_ratio: of the material.
     """
     tetrahedra, rest = replica.tetrahedra, replica.rest
@@ -186,7 +188,8 @@ def von_mises(replica: MeshReplica, youngs_modulus: float, poissons_ratio: float
     turned = np.moveaxis(moved[tetrahedra[:, 1:]] - moved[tetrahedra[:, :1]], 1, 2)
     gradient = turned @ np.linalg.inv(edges)
     strain = (np.swapaxes(gradient, 1, 2) @ gradient - np.eye(3)) / 2
-    mu = youngs_modulus / (2 * (1 + poissons_ratio))
+    regions = replica.regions if len(replica.regions) else 0
+    mu = np.atleast_1d(youngs_modulus)[regions] / (2 * (1 + poissons_ratio))
     deviator = strain - np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3
     stress = 2 * mu * np.sqrt(1.5 * (deviator**2).sum(axis=(1, 2)))
     volumes = np.abs(np.linalg.det(edges)) / 6

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 from cutting_trainer_msgs.msg import Contact, ForceSample
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -148,9 +149,8 @@ class ViewerNode(ManagedNode):
         self._nominal = haptics.rate, tissue.integration.rate
         self._force_scale = haptics.force_scale
         material = tissue.material
-        self._markers = Markers(
-            ros.FRAME, *self._colouring, material.youngs_modulus, material.poissons_ratio
-        )
+        moduli = np.array([material.youngs_modulus, *tissue.region_values('youngs_modulus')])
+        self._markers = Markers(ros.FRAME, *self._colouring, moduli, material.poissons_ratio)
         self._device = device
 
     @property

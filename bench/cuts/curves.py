@@ -57,7 +57,7 @@ def slab(cells: tuple[int, int, int] = (16, 16, 3)) -> Organ:
 
 def liver() -> Organ:
     """Return the shipped liver."""
-    nodes, tetrahedra, _ = load_tissue(load_scene('liver').tissue)
+    nodes, tetrahedra, *_ = load_tissue(load_scene('liver').tissue)
     return organ_of('liver', nodes, tetrahedra.astype(np.int64))
 
 

@@ -41,7 +41,7 @@ def strokes() -> tuple[Stroke, ...]:
     slant = drawn(_line(middle, 62.0, 0.040), (0.25, 0.15, 1.0), 0.030)
     bend = drawn(_arc(middle, 25.0, 0.040), (0.1, 0.2, 1.0), 0.030)
     across = drawn(_line(middle, -21.0, 0.040), (-0.1, 0.2, 1.0), 0.030)
-    liver, inside, held = load_tissue(load_scene('liver').tissue)
+    liver, inside, held, _ = load_tissue(load_scene('liver').tissue)
     through = drawn(_line(np.array([-0.02, 0.0, 0.035]), 83.0, 0.060), (0.1, 0.0, 1.0), 0.015)
     return (
         Stroke('plane', nodes, tetrahedra, free, (slant,)),
@@ -54,7 +54,7 @@ def strokes() -> tuple[Stroke, ...]:
 def random_planes() -> tuple[Stroke, ...]:
     """Return planes of any direction through the block, 30, and through the liver, 12."""
     found: list[Stroke] = []
-    liver, inside, _ = load_tissue(load_scene('liver').tissue)
+    liver, inside, *_ = load_tissue(load_scene('liver').tissue)
     for name, count in (('block', 30), ('liver', 12)):
         for k in range(count):
             rng = np.random.default_rng(k)

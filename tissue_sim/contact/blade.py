@@ -64,12 +64,14 @@ class Resistance:
         friction: per immersed length [N/m].
         tip_width: of the slit that the tip opens [m]; 0: the blade enters by `threshold`, and its
             tip resists by nothing.
+        regions: toughness and friction of regions 1, 2, ... of the mesh; region 0 has those above.
     """
 
     threshold: float
     toughness: float
     friction: float
     tip_width: float = 0.0
+    regions: tuple[tuple[float, float], ...] = ()
 
 
 class Turning(NamedTuple):
@@ -117,9 +119,11 @@ class Blade:
         hint: int,
         line_compliance: float = 0.0,
     ) -> None:
+        r = resistance
+        toughness, friction = np.array([(r.toughness, r.friction), *r.regions]).T.copy()
         spine = float(line_compliance * np.log(BLADE_HEIGHT / BLADE_THICKNESS))
-        at_tip = resistance.toughness * resistance.tip_width
-        self._law = Law(1.0, resistance.toughness, resistance.friction, np.zeros(3), spine, at_tip)
+        at_tip = toughness * r.tip_width
+        self._law = Law(1.0, toughness, friction, np.zeros(3), spine, at_tip)
         self._device = np.array([root, tip])
         self._moved = np.zeros((POINTS, 3))
         self._state = Edge(
@@ -128,6 +132,7 @@ class Blade:
             np.zeros((POINTS, 4)),
             np.zeros(POINTS),
             np.array([hint]),
+            np.zeros(POINTS, np.int64),
         )
         self._strips = Strips.empty()
         self._tip, self._edge = tip.copy(), root - tip
@@ -215,7 +220,7 @@ class Blade:
         margin += float(np.linalg.norm(points[1] - points[0]))
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
         among = near.find(positions, low, high)
-        tissue = Tissue(positions, mesh.tetrahedra, mesh.neighbors, among, opened)
+        tissue = Tissue(positions, mesh.tetrahedra, mesh.neighbors, among, opened, mesh.regions)
         pull = follow_device(self._state, self._strips, points, self._moved, tissue, self._law)
         self._settle(pull)
 
@@ -277,8 +282,8 @@ class Blade:
         self.limit, self.lag = float(pull.limit), float(pull.lag)
         self.paid += float(pull.paid)
         self.rubbed += float(pull.rubbed)
-        free = self.paid - self._confirmed <= self._law.toughness * _MIN_AREA
-        if pull.held and free and not self._failed and self._law.toughness > 0.0:
+        free = self.paid - self._confirmed <= self._law.toughness.max() * _MIN_AREA
+        if pull.held and free and not self._failed and self._law.toughness.min() > 0.0:
             # Spine or flat have carried the tissue along: nothing is to be opened.
             self._cut_tip, self._cut_edge = self._tip.copy(), self._edge.copy()
         length = float(np.linalg.norm(root - tip)) / POINTS

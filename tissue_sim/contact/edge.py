@@ -55,6 +55,7 @@ class Edge(NamedTuple):
         weights: barycentric coordinates in it, shape (POINTS, 4).
         spans: how much of the edge each stands for [pieces]; 0: in the air, shape (POINTS,).
         hint: a tetrahedron near the edge, shape (1,).
+        region: of the tissue around each, shape (POINTS,).
     """
 
     points: np.ndarray
@@ -62,6 +63,7 @@ class Edge(NamedTuple):
     weights: np.ndarray
     spans: np.ndarray
     hint: np.ndarray
+    region: np.ndarray
 
 
 class Tissue(NamedTuple):
@@ -72,6 +74,7 @@ class Tissue(NamedTuple):
         tetrahedra, neighbors: of the mesh, shape (m, 4).
         near: tetrahedra among which points are looked for, shape (k,).
         opened: triangles of the surface that cuts have opened, shape (c, 3).
+        region: of the tetrahedra, shape (m,); (0,): one.
     """
 
     positions: np.ndarray
@@ -79,6 +82,7 @@ class Tissue(NamedTuple):
     neighbors: np.ndarray
     near: np.ndarray
     opened: np.ndarray
+    region: np.ndarray
 
 
 class Pull(NamedTuple):
@@ -186,10 +190,9 @@ def carry_edge(edge, strips, device, moved, positions, law):
         of friction [J].
     """
     direction, piece = _direction(device)
-    grip = law.friction * piece / law.stiffness
     deeper = 0.0
     if edge.spans[0] > 0.0:
-        deeper = law.at_tip / edge.spans.sum() / law.stiffness
+        deeper = law.at_tip[edge.region[0]] / edge.spans.sum() / law.stiffness
     ways, rubbed, first, last = np.zeros((POINTS, 3)), 0.0, -1, 0
     for i in range(POINTS):
         if edge.spans[i] == 0.0:
@@ -202,6 +205,7 @@ def carry_edge(edge, strips, device, moved, positions, law):
         held, pulled = _split(device[i] - edge.points[i], direction)
         sliced, pushed = _split(moved[i], direction)
         ratio = sliced / pushed if pushed > 0.0 else 0.0
+        grip = law.friction[edge.region[i]] * piece / law.stiffness
         most = max(max(held, grip), ratio * pulled)
         stretch = dot(device[i] - carried, direction)
         kept = min(max(stretch, -max(most, grip + deeper)), most)
@@ -340,10 +344,17 @@ def _immerse(edge, device, tissue):
             edge.spans[i] = 0.0
             continue
         edge.spans[i], edge.hint[0] = 1.0, found[i]
-        for k in range(4):
-            edge.corners[i, k] = tissue.tetrahedra[found[i], k]
+        _enter(edge, i, tissue, found[i])
     _measure_spans(edge, device, tissue)
     _relax(edge, device, tissue, before)
+
+
+@inner
+def _enter(edge, i, tissue, tet):
+    """Note the tetrahedron around a point."""
+    for k in range(4):
+        edge.corners[i, k] = tissue.tetrahedra[tet, k]
+    edge.region[i] = tissue.region[tet] if tissue.region.shape[0] > 0 else 0
 
 
 @inner
@@ -410,8 +421,7 @@ def _relax(edge, device, tissue, before):
         _locate(tissue, one, edge.hint[0], found, weights)
         if found[0] >= 0:
             edge.points[i], edge.weights[i] = one[0], weights[0]
-            for k in range(4):
-                edge.corners[i, k] = tissue.tetrahedra[found[0], k]
+            _enter(edge, i, tissue, found[0])
 
 
 @inner
@@ -458,7 +468,7 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits):
     for i in range(POINTS):
         if edge.spans[i] > 0.0:
             work += limits[i] * slid[i]
-            rub += law.friction * blade.piece * edge.spans[i] * slid[i]
+            rub += law.friction[edge.region[i]] * blade.piece * edge.spans[i] * slid[i]
             edge.points[i] += ways[i]
     _lag_behind(edge, device)
     if cutting:
@@ -488,8 +498,9 @@ def _resist(edge, ways, faces, blade, law, fresh, limits):
     e0, e1, e2 = blade.direction[0], blade.direction[1], blade.direction[2]
     one_sided = blade.facing.any()
     at_tip = 0.0
-    if law.at_tip > 0.0 and edge.spans[0] > 0.0 and _is_tip_fresh(edge, blade, faces):
-        at_tip = law.at_tip / edge.spans.sum()
+    tip = law.at_tip[edge.region[0]]
+    if tip > 0.0 and edge.spans[0] > 0.0 and _is_tip_fresh(edge, blade, faces):
+        at_tip = tip / edge.spans.sum()
     for i in range(POINTS):
         fresh[i], limits[i], blade.shares[i] = False, 0.0, 0.0
         if edge.spans[i] == 0.0:
@@ -500,8 +511,8 @@ def _resist(edge, ways, faces, blade, law, fresh, limits):
         x, y, z = ways[i, 0], ways[i, 1], ways[i, 2]
         a, b, c = y * e2 - z * e1, z * e0 - x * e2, x * e1 - y * e0
         sine = np.sqrt(a * a + b * b + c * c) / max(np.sqrt(x * x + y * y + z * z), _TINY)
-        cutting = law.toughness * sine if fresh[i] else 0.0
-        limits[i] = blade.piece * edge.spans[i] * (cutting + law.friction)
+        cutting = law.toughness[edge.region[i]] * sine if fresh[i] else 0.0
+        limits[i] = blade.piece * edge.spans[i] * (cutting + law.friction[edge.region[i]])
         if at_tip > 0.0:
             deeper = -(x * e0 + y * e1 + z * e2) / max(np.sqrt(x * x + y * y + z * z), _TINY)
             limits[i] += at_tip * edge.spans[i] * max(deeper, 0.0)

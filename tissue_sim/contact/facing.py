@@ -22,20 +22,20 @@ class Law(NamedTuple):
 
     Attributes:
         stiffness: of the spring of a point, for each piece that it stands for [N/m].
-        toughness: [J/m^2].
-        friction: per length [N/m].
+        toughness: by region [J/m^2].
+        friction: per length, by region [N/m].
         facing: unit vector from the blade's spine to its edge; zero: it cuts all round, shape (3,).
         compliance: by which the spine goes deeper into the tissue than the flat would, by load per
             length [m^2/N].
-        at_tip: resistance of the tip to going deeper along the blade [N].
+        at_tip: resistance of the tip to going deeper along the blade, by region [N].
     """
 
     stiffness: float
-    toughness: float
-    friction: float
+    toughness: np.ndarray
+    friction: np.ndarray
     facing: np.ndarray
     compliance: float
-    at_tip: float
+    at_tip: np.ndarray
 
 
 class Held(NamedTuple):

@@ -97,14 +97,14 @@ def _flush(law, domains, waiting, chunk, f):
 
 
 @inner(error_model='numpy')
-def _add_domains(law, domains, awake, u, f, mode):
+def _add_domains(law, domains, spans, u, f, mode):
     """Add the forces of the domains; return their energy [J]."""
     chunk, waiting = np.zeros(SLOTS_OF_LAW * LANES), np.empty(LANES, np.int64)
     h, p = np.empty(9), np.empty(9)
     least = law.tolerance[0] * law.tolerance[0]
     total, count = 0.0, 0
-    for s in range(awake.shape[0]):
-        for i in range(awake[s, 0], min(domains.used.shape[0], awake[s, 1])):
+    for s in range(spans.shape[0]):
+        for i in range(spans[s, 0], min(domains.used.shape[0], spans[s, 1])):
             (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = smoothed_gradient(domains, u, i)
             square = xx * xx + xy * xy + xz * xz + yx * yx + yy * yy + yz * yz
             square += zx * zx + zy * zy + zz * zz
@@ -193,7 +193,7 @@ def _add_elements(law, elements, chunks, u, f, mode):
 
 
 @inner(error_model='numpy')
-def add_law_forces(law, domains, elements, awake, chunks, u, f, mode):
+def add_law_forces(law, domains, elements, awake, spans, chunks, u, f, mode):
     """Add the forces of domains and elements; those of the tensors are in f.
 
     Args:
@@ -201,6 +201,7 @@ def add_law_forces(law, domains, elements, awake, chunks, u, f, mode):
         domains: smoothing domains.
         elements: shape functions and volumes.
         awake: intervals of evaluated nodes, shape (s, 2).
+        spans: intervals of evaluated domains, shape (s, 2).
         chunks: evaluated chunks of elements, shape (k,).
         u: displacement by coordinate [m], shape (3 n,).
         f: added to [N], shape (3 n,).
@@ -216,12 +217,12 @@ def add_law_forces(law, domains, elements, awake, chunks, u, f, mode):
             for i in range(3 * awake[s, 0], 3 * awake[s, 1]):
                 total += 0.5 * u[i] * f[i]
     law.implicit[0] = 1 if mode == _IMPLICIT else 0
-    total += _add_domains(law, domains, awake, u, f, mode)
+    total += _add_domains(law, domains, spans, u, f, mode)
     return total + _add_elements(law, elements, chunks, u, f, mode)
 
 
 @inner(error_model='numpy')
-def add_law_bounds(law, domains, elements, awake, chunks, x, f):
+def add_law_bounds(law, domains, elements, spans, chunks, x, f):
     """Add, to a linear product, the bounds of the tangent where the law counts.
 
     Arguments: see `add_law_forces`; x is multiplied.
@@ -229,8 +230,8 @@ def add_law_bounds(law, domains, elements, awake, chunks, x, f):
     if law.implicit[0] == 0:
         return
     h, linear, g = np.empty(9), np.empty(9), np.empty(12)
-    for s in range(awake.shape[0]):
-        for i in range(awake[s, 0], min(domains.used.shape[0], awake[s, 1])):
+    for s in range(spans.shape[0]):
+        for i in range(spans[s, 0], min(domains.used.shape[0], spans[s, 1])):
             bound = law.domain_bounds[i]
             if bound == 0.0:
                 continue
@@ -325,11 +326,11 @@ def _flush_rows(law, domains, waiting, chunk, rows, strain):
 
 
 @kernel(error_model='numpy')
-def add_tangent_rows(law, domains, elements, awake, chunks, u, rows, strain):
+def add_tangent_rows(law, domains, elements, spans, chunks, u, rows, strain):
     """Add to bounds of row sums what the tangent has more than the linear stiffness.
 
     Args:
-        law, domains, elements, awake, chunks, u: see `add_law_forces`.
+        law, domains, elements, spans, chunks, u: see `add_law_forces`.
         rows: added to [N/m], shape (n,).
         strain: output: number of domains and of elements beyond the tolerance, least and largest J
             of these domains, their least and largest principal stretch, shape (6,).
@@ -338,8 +339,8 @@ def add_tangent_rows(law, domains, elements, awake, chunks, u, rows, strain):
     least, count, n = law.tolerance[0] ** 2, 0, domains.used.shape[0]
     strain[0] = strain[1] = 0.0
     strain[2:] = 1.0
-    for s in range(awake.shape[0]):
-        for i in range(awake[s, 0], min(n, awake[s, 1])):
+    for s in range(spans.shape[0]):
+        for i in range(spans[s, 0], min(n, spans[s, 1])):
             (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = smoothed_gradient(domains, u, i)
             square = xx * xx + xy * xy + xz * xz + yx * yx + yy * yy + yz * yz
             square += zx * zx + zy * zy + zz * zz

@@ -22,8 +22,9 @@ from cutting_trainer.tissue_sim.elasticity.rotation import (
     stress,
 )
 from cutting_trainer.tissue_sim.elasticity.simd import prefetch
-from cutting_trainer.tissue_sim.elasticity.tensor_mass import shape_gradients
+from cutting_trainer.tissue_sim.elasticity.tensor_mass import ONE_MATERIAL, shape_gradients
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, grown
+from cutting_trainer.tissue_sim.mesh.topology import of_region
 
 KEPT = 15
 """Slots of an element: three gradients, rotation, 2 mu V, lambda V."""
@@ -43,18 +44,19 @@ class Elements(NamedTuple):
 
 
 @kernel
-def gather_elements(elements, tetrahedra, rest, which, count, lame_lambda, lame_mu):
+def gather_elements(elements, links, rest, which, count, lame_lambda, lame_mu, relative):
     """Write the slots of some elements, with identity rotations.
 
     Args:
         elements: written for `which` only.
-        tetrahedra: shape (m, 4).
+        links: connectivity.
         rest: rest positions [m], shape (n, 3).
         which: slots; those from `count` on are cleared, shape (r,).
         count: number of elements m.
         lame_lambda, lame_mu: [Pa].
+        relative: stiffness by region, relative to these.
     """
-    g = np.empty((4, 3))
+    tetrahedra, g = links.tetrahedra, np.empty((4, 3))
     for tet in which:
         chunk, lane = tet // LANES, tet % LANES
         at = chunk * KEPT * LANES + lane
@@ -64,7 +66,7 @@ def gather_elements(elements, tetrahedra, rest, which, count, lame_lambda, lame_
         for a in range(4):
             elements.corners[(4 * chunk + a) * LANES + lane] = 0
         if tet < count:
-            volume = shape_gradients(rest, tetrahedra, tet, g)
+            volume = shape_gradients(rest, tetrahedra, tet, g) * of_region(links, tet, relative)
             for a in range(4):
                 node = tetrahedra[tet, a]
                 elements.corners[(4 * chunk + a) * LANES + lane] = 3 * node
@@ -192,10 +194,18 @@ class CorotationalElements:
     Args:
         mesh: the mesh; followed by `update`.
         lame_lambda, lame_mu: [Pa].
+        relative: stiffness by region, relative to these.
     """
 
-    def __init__(self, mesh: TetMesh, lame_lambda: float, lame_mu: float) -> None:
+    def __init__(
+        self,
+        mesh: TetMesh,
+        lame_lambda: float,
+        lame_mu: float,
+        relative: np.ndarray = ONE_MATERIAL,
+    ) -> None:
         self._mesh = mesh
+        self._relative = relative
         self._lame = (lame_lambda, lame_mu)
         self._count = 0
         self._elements = Elements(np.zeros(0, np.uint32), np.zeros(0))
@@ -219,8 +229,9 @@ class CorotationalElements:
         gone = np.arange(count, self._count)
         which = np.unique(np.concatenate([np.asarray(tetrahedra, np.int64), new, gone]))
         gather_elements(
-            self._elements, self._mesh.tetrahedra, self._mesh.rest, which, count, *self._lame
-        )
+            self._elements, self._mesh.links, self._mesh.rest, which, count, *self._lame,
+            self._relative,
+        )  # fmt: skip
         self._count = count
 
     @property

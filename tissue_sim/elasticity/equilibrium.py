@@ -148,7 +148,7 @@ def rotated_stiffness(model: ElasticModel, u: Floats) -> csr_matrix:
         left, _, right = np.linalg.svd(np.einsum('mki,mkj->mij', moved, gradients))
         left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
         gradients = gradients @ np.swapaxes(left @ right, 1, 2)
-    volume = mesh.volumes()[:, None, None]
+    volume = (mesh.volumes() * mesh.by_region(material.relative_stiffness))[:, None, None]
     lam, mu = material.lame_lambda, material.lame_mu
     blocks = np.einsum('mai,mbj->maibj', gradients, gradients)
     dots = mu * np.einsum('mai,mbi->mab', gradients, gradients)

@@ -36,7 +36,7 @@ class Points(NamedTuple):
 
     Attributes:
         gradient: displacement by coordinate to its gradients [1/m], shape (9 k, 3 n).
-        weight: volumes [m^3], shape (k,).
+        weight: volumes times relative stiffness [m^3], shape (k,).
         lame: lambda and mu [Pa].
         stiffening: b of the law.
     """
@@ -53,22 +53,23 @@ def smoothed_points(mesh: TetMesh, material: Material) -> list[Points]:
     A share of mu is evaluated in elements, the rest averaged over nodes.
     """
     lam, mu, b = material.lame_lambda, material.lame_mu, material.stiffening
-    domains = NodalSmoothing(mesh, lam, (1 - PLAIN_SHARE) * mu).operands
-    rows = np.repeat(np.arange(mesh.node_count), domains.used)
+    relative = material.relative_stiffness
+    domains = NodalSmoothing(mesh, lam, (1 - PLAIN_SHARE) * mu, relative).operands
+    count = len(domains.used)
+    rows = np.repeat(np.arange(count), domains.used)
     slots = np.repeat(domains.start - np.cumsum(domains.used) + domains.used, domains.used)
     slots = slots + np.arange(len(rows))
     vectors = domains.vectors.reshape(-1, 3)[slots]
-    averaged = _gradient(rows, domains.columns[slots] // 3, vectors, mesh.node_count, mesh)
+    averaged = _gradient(rows, domains.columns[slots] // 3, vectors, count, mesh)
     tets = mesh.tetrahedra.astype(np.int64)
     edges = np.moveaxis(mesh.rest[tets[:, 1:]] - mesh.rest[tets[:, :1]], 1, 2)
     inner = np.linalg.inv(edges)
     shapes = np.concatenate([-inner.sum(axis=1, keepdims=True), inner], axis=1)
     rows = np.repeat(np.arange(len(tets)), 4)
     plain = _gradient(rows, tets.ravel(), shapes.reshape(-1, 3), len(tets), mesh)
-    volume = domains.volume[: mesh.node_count].copy()
     return [
-        Points(averaged, volume, (lam, (1 - PLAIN_SHARE) * mu), b),
-        Points(plain, mesh.volumes(), (0.0, PLAIN_SHARE * mu), b),
+        Points(averaged, domains.volume.copy(), (lam, (1 - PLAIN_SHARE) * mu), b),
+        Points(plain, mesh.volumes() * mesh.by_region(relative), (0.0, PLAIN_SHARE * mu), b),
     ]
 
 

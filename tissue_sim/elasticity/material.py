@@ -3,10 +3,25 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
+
+@dataclass(frozen=True)
+class RegionMaterial:
+    """Constants of a region that are not those of the tissue's material.
+
+    Attributes:
+        youngs_modulus: E [Pa].
+        density: rho [kg/m^3].
+    """
+
+    youngs_modulus: float
+    density: float
+
 
 @dataclass(frozen=True)
 class Material:
-    """A homogeneous isotropic tissue.
+    """An isotropic tissue, of one material or of several that differ in stiffness and density.
 
     Attributes:
         youngs_modulus: E [Pa].
@@ -17,6 +32,9 @@ class Material:
         stiffening: b of the law exp(b x) of the model `stiffening`, 0: neo-Hookean.
         prony: share g of the shear modulus that relaxes, and its time [s], by term: shear has
             G(t) = G (1 - sum of g (1 - exp(-t / tau))). E is that of the first moment, t = 0.
+        regions: constants of regions 1, 2, ... of the mesh; region 0 has those above. Poisson's
+            ratio, stiffening and prony are common: all stresses of a region are then in proportion
+            to its E.
     """
 
     youngs_modulus: float
@@ -26,6 +44,17 @@ class Material:
     beta: float = 0.0
     stiffening: float = 0.0
     prony: tuple[tuple[float, float], ...] = ()
+    regions: tuple[RegionMaterial, ...] = ()
+
+    @property
+    def relative_stiffness(self) -> np.ndarray:
+        """E by region, relative to that of region 0, shape (1 + r,)."""
+        return np.array([1.0, *(r.youngs_modulus / self.youngs_modulus for r in self.regions)])
+
+    @property
+    def densities(self) -> np.ndarray:
+        """Density by region [kg/m^3], shape (1 + r,)."""
+        return np.array([self.density, *(r.density for r in self.regions)])
 
     @property
     def lame_lambda(self) -> float:

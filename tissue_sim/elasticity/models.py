@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.elasticity.adaptive_law import (
     NO_LAW,
@@ -62,6 +63,7 @@ from cutting_trainer.tissue_sim.mesh.adjacency import (
     nodes_of_chunks,
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, Touched, grown
+from cutting_trainer.tissue_sim.mesh.topology import of_region
 
 ModelName = Literal[
     'linear', 'linear_smoothed', 'corotational', 'corotational_smoothed', 'stiffening'
@@ -87,7 +89,8 @@ class Operands(NamedTuple):
         domains: smoothing domains of nodes, or none.
         elements: corotational elements, or none.
         rotating: 1 if domains and elements rotate with the tissue, else 0.
-        awake: intervals of nodes whose rows and domains are evaluated, shape (s, 2).
+        awake: intervals of nodes whose rows are evaluated, shape (s, 2).
+        spans: intervals of evaluated domains: `awake`, and those of further regions at its nodes.
         reach: intervals of nodes read and written by these, shape (s, 2).
         chunks: evaluated chunks of elements, shape (k,).
         local: complete rows of a part with its own numbering of u and f, or none.
@@ -101,6 +104,7 @@ class Operands(NamedTuple):
     elements: Elements
     rotating: int
     awake: np.ndarray
+    spans: np.ndarray
     reach: np.ndarray
     chunks: np.ndarray
     local: LocalRows
@@ -170,14 +174,14 @@ def _elastic_force(operands, u, f, rotation_steps):
     _begin(operands, u, f)
     if operands.law.domains.shape[0] > 0:
         return add_law_forces(
-            operands.law, operands.domains, operands.elements, operands.awake, operands.chunks,
-            u, f, rotation_steps,
+            operands.law, operands.domains, operands.elements, operands.awake, operands.spans,
+            operands.chunks, u, f, rotation_steps,
         )  # fmt: skip
     energy = 0.0
     if operands.domains.used.shape[0] > 0 and not operands.rotating:
-        add_linear_smoothed_forces(operands.domains, operands.awake, u, f)
+        add_linear_smoothed_forces(operands.domains, operands.spans, u, f)
     elif operands.domains.used.shape[0] > 0:
-        energy += add_smoothed_forces(operands.domains, operands.awake, u, f, rotation_steps, 1.0)
+        energy += add_smoothed_forces(operands.domains, operands.spans, u, f, rotation_steps, 1.0)
     if operands.chunks.shape[0] > 0:
         energy += add_elements(operands.elements, operands.chunks, u, f, rotation_steps, 1.0)
     return energy
@@ -201,34 +205,36 @@ def stiffness_product(operands, x, f):
 def _stiffness_product(operands, x, f):
     _begin(operands, x, f)
     if operands.law.domains.shape[0] > 0:
-        add_linear_smoothed_forces(operands.domains, operands.awake, x, f)
+        add_linear_smoothed_forces(operands.domains, operands.spans, x, f)
         add_law_bounds(
-            operands.law, operands.domains, operands.elements, operands.awake, operands.chunks, x, f
+            operands.law, operands.domains, operands.elements, operands.spans, operands.chunks, x, f
         )
         return
     if operands.domains.used.shape[0] > 0 and not operands.rotating:
-        add_linear_smoothed_forces(operands.domains, operands.awake, x, f)
+        add_linear_smoothed_forces(operands.domains, operands.spans, x, f)
     elif operands.domains.used.shape[0] > 0:
-        add_smoothed_forces(operands.domains, operands.awake, x, f, 0, 0.0)
+        add_smoothed_forces(operands.domains, operands.spans, x, f, 0, 0.0)
     if operands.chunks.shape[0] > 0:
         add_elements(operands.elements, operands.chunks, x, f, 0, 0.0)
 
 
 @kernel
-def gather_incident_rows(links, rest, nodes, constants, mass, diagonal, norms):
+def gather_incident_rows(links, rest, nodes, constants, relative, densities, mass, diagonal, norms):
     """Compute masses, diagonal and norms of plain elements' rows at some nodes.
 
     Args:
         links: connectivity.
         rest: rest positions [m], shape (n, 3).
         nodes: which, shape (r,).
-        constants: lambda [Pa], mu [Pa], density [kg/m^3].
+        constants: lambda [Pa], mu [Pa].
+        relative: stiffness by region, relative to these.
+        densities: by region [kg/m^3].
         mass: output [kg] (thesis eq. 4.2), shape (>= n,).
         diagonal: output [N/m], shape (>= 3 n,).
         norms: output, sums of the Frobenius norms of the element blocks K_ij of row i [N/m];
             element rotations do not change them, shape (>= n,).
     """
-    lame_lambda, lame_mu, density = constants[0], constants[1], constants[2]
+    lame_lambda, lame_mu = constants[0], constants[1]
     g = np.empty((4, 3))
     for node in nodes:
         mass[node] = 0.0
@@ -239,7 +245,8 @@ def gather_incident_rows(links, rest, nodes, constants, mass, diagonal, norms):
         while corner >= 0:
             a = corner % 4
             volume = shape_gradients(rest, links.tetrahedra, corner // 4, g)
-            mass[node] += 0.25 * density * volume
+            mass[node] += 0.25 * of_region(links, corner // 4, densities) * volume
+            volume *= of_region(links, corner // 4, relative)
             dot = volume * lame_mu * (g[a, 0] * g[a, 0] + g[a, 1] * g[a, 1] + g[a, 2] * g[a, 2])
             both = volume * (lame_lambda + lame_mu)
             for i in range(3):
@@ -323,6 +330,9 @@ class ElasticModel:
 
     Attributes:
         load: forces that act beside the elastic ones [N], shape (3 n,); (0,): none.
+
+    Raises:
+        MeshError: the mesh has a region without constants.
     """
 
     def __init__(
@@ -337,12 +347,17 @@ class ElasticModel:
         self.name = name
         self.rotating = not name.startswith('linear')
         self.lawful = name == 'stiffening'
-        lam, mu = material.lame_lambda, material.lame_mu
+        lam, mu, relative = material.lame_lambda, material.lame_mu, material.relative_stiffness
+        last = int(mesh.regions.max(initial=0))
+        if last >= len(relative):
+            raise MeshError(
+                f'the mesh has a region {last}, the material {len(relative) - 1} regions'
+            )
         smoothed = name.endswith('_smoothed') or self.lawful
         plain = (0.0, PLAIN_SHARE * mu) if smoothed else (lam, mu)
         corotational = name.startswith('corotational')
-        self.tensor_mass = None if corotational else TensorMass(mesh, *plain)
-        self._elements = CorotationalElements(mesh, *plain) if self.rotating else None
+        self.tensor_mass = None if corotational else TensorMass(mesh, *plain, relative)
+        self._elements = CorotationalElements(mesh, *plain, relative) if self.rotating else None
         self._law = NO_LAW
         if self.lawful:
             own = PLAIN_SHARE * mu
@@ -352,7 +367,9 @@ class ElasticModel:
                 tolerance=np.array([tolerance, 2.0 * tolerance]),
                 implicit=np.zeros(1, np.int64),
             )
-        self._domains = NodalSmoothing(mesh, lam, (1 - PLAIN_SHARE) * mu) if smoothed else None
+        self._domains = None
+        if smoothed:
+            self._domains = NodalSmoothing(mesh, lam, (1 - PLAIN_SHARE) * mu, relative)
         self._assembled = name == 'linear'
         self._neighbours: NodeAdjacency | None = None
         self._mass = np.zeros(0)
@@ -384,11 +401,12 @@ class ElasticModel:
         self._norms = grown(self._norms, n)
         self._diagonal = grown(self._diagonal, 3 * len(self._mass))
         m = self.material
-        constants = np.array([m.lame_lambda, m.lame_mu, m.density])
+        constants = np.array([m.lame_lambda, m.lame_mu])
         which = np.asarray(nodes, np.int64)
         gather_incident_rows(
-            links, self.mesh.rest, which, constants, self._mass, self._diagonal, self._norms
-        )
+            links, self.mesh.rest, which, constants, m.relative_stiffness, m.densities,
+            self._mass, self._diagonal, self._norms,
+        )  # fmt: skip
         if self._assembled and self.tensor_mass is not None:
             assembled_norms(self.tensor_mass.tensors, links, which, self._norms)
 
@@ -461,6 +479,7 @@ class ElasticModel:
         if not self.lawful:
             return NO_LAW
         law, n = self._law, self.mesh.node_count
+        n = n if self._domains is None else self._domains.count
         slots = -(-len(self.mesh.tetrahedra) // LANES) * LANES
         if (len(law.domain_bounds), len(law.element_bounds)) != (n, slots):
             law = law._replace(domain_bounds=np.zeros(n), element_bounds=np.zeros(slots))
@@ -476,6 +495,7 @@ class ElasticModel:
             self._elements.operands if self._elements else _NO_ELEMENTS,
             int(self.rotating),
             rows,
+            rows if self._domains is None else self._domains.spans(rows),
             reach,
             chunks,
             NO_LOCAL_ROWS,
@@ -496,8 +516,8 @@ class ElasticModel:
         own, all_of_them = np.array([[0, len(nodes)]]), np.array([[0, len(place.at) // 3]])
         none = np.zeros(0, np.int64)
         operands = Operands(
-            _NO_ROWS, _NO_DOMAINS, _NO_ELEMENTS, 0, own, all_of_them, none, place.rows, NO_LAW,
-            _NO_LOAD, NO_COARSE_ROWS,
+            _NO_ROWS, _NO_DOMAINS, _NO_ELEMENTS, 0, own, own, all_of_them, none, place.rows,
+            NO_LAW, _NO_LOAD, NO_COARSE_ROWS,
         )  # fmt: skip
         return ModelPart(place, operands)
 

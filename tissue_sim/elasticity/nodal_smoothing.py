@@ -7,6 +7,10 @@ of each of its elements, and its displacement gradient their mean by volume,
 
 Row i needs the elements of node i only. A cut therefore recomputes the rows of the touched nodes,
 and a domain ends at the cut faces. The forces V_i P_i G_ij use the same row, while it is in cache.
+
+Where regions of different materials meet, a node has a domain for each: a mean of their strains
+would be that of neither. The domain of the first region is the row of the node; those of the others
+follow the rows of all nodes.
 """
 
 from typing import NamedTuple
@@ -37,25 +41,29 @@ from cutting_trainer.tissue_sim.elasticity.simd import (
     unpack,
 )
 from cutting_trainer.tissue_sim.elasticity.tensor_mass import (
+    ONE_MATERIAL,
     longer,
     move_row,
     packed,
     shape_gradients,
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, grown
+from cutting_trainer.tissue_sim.mesh.topology import of_region
 
 
 class SmoothingDomains(NamedTuple):
     """Rows of the smoothed gradients; row i of a node spans `start[i]` to `start[i] + used[i]`.
 
+    After the rows of the n nodes come those of further regions, r in all.
+
     Attributes:
-        start, used, room: first slot, used slots and slots of each row, shape (n,).
+        start, used, room: first slot, used slots and slots of each row, shape (r,).
         columns: three times the node j of each entry, shape (c,). The node itself is among them
             at the surface only: in the interior G_ii is 0.
         vectors: G_ij [1/m], with some after the last row because three are read as four, shape (3
             c,).
-        volume: of the domains [m^3], shape (n,).
-        rotation: quaternions, shape (n, 4).
+        volume: of the domains, times their relative stiffness [m^3], shape (r,).
+        rotation: quaternions, shape (r, 4).
         lame: lambda and mu [Pa], shape (2,).
     """
 
@@ -80,31 +88,77 @@ def _on_surface(links, node):
     return False
 
 
+@inner
+def _between_regions(links, node):
+    """Return whether the elements of a node are of several regions."""
+    if links.region.shape[0] == 0:
+        return False
+    corner = links.first_corner[node]
+    region = links.region[corner // 4]
+    while corner >= 0:
+        if links.region[corner // 4] != region:
+            return True
+        corner = links.corner_next[corner]
+    return False
+
+
 @kernel
-def gather_smoothing_domains(domains, filled, links, rest, nodes):
-    """Compute the rows of some nodes from their elements, with identity rotations.
+def regions_at_nodes(links, nodes):
+    """Return 256 times a node plus a region, for the regions of some nodes' elements, ascending.
 
     Args:
-        domains: written for `nodes` only.
+        links: connectivity of a tissue of several regions.
+        nodes: ascending, shape (a,).
+
+    Returns:
+        Shape (b,), int64.
+    """
+    found = [np.int64(0) for _ in range(0)]
+    for node in nodes:
+        seen = np.zeros(256, np.bool_)
+        corner = links.first_corner[node]
+        while corner >= 0:
+            seen[links.region[corner // 4]] = True
+            corner = links.corner_next[corner]
+        for region in range(256):
+            if seen[region]:
+                found.append(np.int64(256 * node + region))
+    return np.array(found, np.int64)
+
+
+@kernel
+def gather_smoothing_domains(domains, filled, links, rest, rows, nodes, regions, relative):
+    """Compute some rows from the elements of their nodes, with identity rotations.
+
+    Args:
+        domains: written for `rows` only.
         filled: slots allocated to rows; grows with moved rows, shape (1,).
         links: connectivity.
         rest: rest positions [m], shape (n, 3).
-        nodes: which rows, shape (r,).
+        rows: which, shape (r,).
+        nodes: of the rows, shape (r,).
+        regions: whose elements count, shape (r,); (0,): all.
+        relative: stiffness by region, by which elements are weighted.
 
     Returns:
-        Index into `nodes` of the first whose row does not fit in the arrays, or -1.
+        Index into `rows` of the first that does not fit in the arrays, or -1.
     """
     g = np.empty((4, 3))
-    for which in range(len(nodes)):
-        node = nodes[which]
-        first = domains.start[node]
+    for which in range(len(rows)):
+        node, row = nodes[which], rows[which]
+        first = domains.start[row]
         used = 0
         total = 0.0
-        outside = _on_surface(links, node)
+        outside = _on_surface(links, node) or _between_regions(links, node)
         corner = links.first_corner[node]
         while corner >= 0:
             tet = corner // 4
-            volume = shape_gradients(rest, links.tetrahedra, tet, g)
+            if regions.shape[0] > 0 and links.region[tet] != regions[which]:
+                corner = links.corner_next[corner]
+                continue
+            volume = shape_gradients(rest, links.tetrahedra, tet, g) * of_region(
+                links, tet, relative
+            )
             total += volume
             for b in range(4):
                 if b == corner % 4 and not outside:
@@ -114,14 +168,12 @@ def gather_smoothing_domains(domains, filled, links, rest, nodes):
                 while slot < first + used and domains.columns[slot] != column:
                     slot += 1
                 if slot == first + used:
-                    if used == domains.room[node]:
+                    if used == domains.room[row]:
                         d = domains
-                        d.used[node] = used
-                        if not move_row(
-                            d.start, d.used, d.room, d.columns, d.vectors, filled, node
-                        ):
+                        d.used[row] = used
+                        if not move_row(d.start, d.used, d.room, d.columns, d.vectors, filled, row):
                             return which
-                        first = d.start[node]
+                        first = d.start[row]
                         slot = first + used
                     used += 1
                     domains.columns[slot] = column
@@ -130,12 +182,12 @@ def gather_smoothing_domains(domains, filled, links, rest, nodes):
                 for i in range(3):
                     domains.vectors[3 * slot + i] += volume * g[b, i]
             corner = links.corner_next[corner]
-        domains.used[node] = used
-        domains.volume[node] = 0.25 * total
+        domains.used[row] = used
+        domains.volume[row] = 0.25 * total
         for slot in range(3 * first, 3 * (first + used)):
             domains.vectors[slot] /= total
-        domains.rotation[node] = 0.0
-        domains.rotation[node, 0] = 1.0
+        domains.rotation[row] = 0.0
+        domains.rotation[row, 0] = 1.0
     return -1
 
 
@@ -259,18 +311,35 @@ def add_smoothed_forces(domains, awake, u, f, rotation_steps, unit):
     return energy
 
 
+_BY_ROW = ('start', 'used', 'room', 'volume', 'rotation')
+
+
 class NodalSmoothing:
     """Smoothing domains of a mesh under cuts.
 
     Args:
         mesh: the mesh; followed by `update`.
         lame_lambda, lame_mu: [Pa].
+        relative: stiffness by region, relative to these.
+        split: whether the regions at a node have a domain each; else they share one, whose strain
+            is their mean by stiffness.
     """
 
-    def __init__(self, mesh: TetMesh, lame_lambda: float, lame_mu: float) -> None:
+    def __init__(
+        self,
+        mesh: TetMesh,
+        lame_lambda: float,
+        lame_mu: float,
+        relative: np.ndarray = ONE_MATERIAL,
+        *,
+        split: bool = True,
+    ) -> None:
         self._mesh = mesh
         self._lame = np.array([lame_lambda, lame_mu])
-        n = self._mesh.node_count
+        self._relative = relative
+        self._split = split and len(mesh.regions) > 0
+        self._others = np.zeros(0, np.int64)
+        n = self._nodes = self._mesh.node_count
         tets = self._mesh.tetrahedra.astype(np.int64)
         pairs = [tets[:, [i, j]] for i in range(4) for j in range(4)]
         both = np.concatenate(pairs)
@@ -290,7 +359,7 @@ class NodalSmoothing:
             self._lame,
         )
         self._filled = np.array([slots])
-        self._gather(np.arange(n))
+        self._renew(np.arange(n))
 
     def forget_rotations(self) -> None:
         """Set all rotations to the identity."""
@@ -304,41 +373,83 @@ class NodalSmoothing:
         """
         n, d = self._mesh.node_count, self._domains
         known = len(d.room)
-        self._domains = d._replace(
-            **{
-                name: grown(getattr(d, name), n)
-                for name in ('start', 'used', 'room', 'volume', 'rotation')
-            }
-        )
+        self._grow(n)
         if len(self._domains.room) > known:
             self._domains.room[known:] = 0
-        self._gather(np.asarray(nodes, np.int64))
+        self._renew(np.asarray(nodes, np.int64))
         d = self._domains
-        rows = d.start, d.used, d.room, n
+        rows = d.start, d.used, d.room, self.count
         columns, vectors = packed(*rows, d.columns, d.vectors, self._filled)
         self._domains = d._replace(columns=columns, vectors=vectors)
 
-    def _gather(self, nodes: np.ndarray) -> None:
-        while len(nodes):
+    def _grow(self, rows: int) -> None:
+        d = self._domains
+        self._domains = d._replace(**{name: grown(getattr(d, name), rows) for name in _BY_ROW})
+
+    def _renew(self, nodes: np.ndarray) -> None:
+        """Compute the rows of some nodes, sorted, shape (r,)."""
+        if not self._split:
+            self._nodes = self._mesh.node_count
+            self._gather(nodes, nodes, self._others)
+            return
+        n = self._mesh.node_count
+        keys = regions_at_nodes(self._mesh.links, nodes)
+        first = np.diff(keys // 256, prepend=-1) != 0
+        kept = ~np.isin(self._others // 256, nodes) & (self._others // 256 < n)
+        others = np.union1d(self._others[kept], keys[~first])
+        rows = self._nodes + np.flatnonzero(kept)
+        before = {name: getattr(self._domains, name)[rows] for name in _BY_ROW}
+        self._domains.room[self._nodes : self.count] = 0  # their slots are not those of other rows
+        kept_keys, self._others, self._nodes = self._others[kept], others, n
+        self._grow(self.count)
+        self._domains.room[n : self.count] = 0
+        rows = n + np.searchsorted(others, kept_keys)
+        for name, values in before.items():
+            getattr(self._domains, name)[rows] = values
+        self._gather(nodes, nodes, keys[first] % 256)
+        rows = n + np.searchsorted(others, keys[~first])
+        self._gather(rows, keys[~first] // 256, keys[~first] % 256)
+
+    def _gather(self, rows: np.ndarray, nodes: np.ndarray, regions: np.ndarray) -> None:
+        while len(rows):
             full = gather_smoothing_domains(
-                self._domains, self._filled, self._mesh.links, self._mesh.rest, nodes
-            )
+                self._domains, self._filled, self._mesh.links, self._mesh.rest, rows, nodes,
+                regions, self._relative,
+            )  # fmt: skip
             if full < 0:
                 return
-            nodes = nodes[full:]
+            rows, nodes, regions = rows[full:], nodes[full:], regions[full:]
             d = self._domains
-            size = int(self._filled[0]) + longer.py_func(int(d.room[nodes[0]])) + 1
+            size = int(self._filled[0]) + longer.py_func(int(d.room[rows[0]])) + 1
             columns = grown(d.columns, size)
             self._domains = d._replace(columns=columns, vectors=grown(d.vectors, 3 * len(columns)))
 
     @property
+    def count(self) -> int:
+        """Number of rows: of the nodes, and of further regions at them."""
+        return self._nodes + len(self._others)
+
+    @property
+    def row_nodes(self) -> np.ndarray:
+        """Node of each row, shape (r,)."""
+        return np.concatenate([np.arange(self._nodes), self._others // 256])
+
+    def spans(self, nodes: np.ndarray) -> np.ndarray:
+        """Return intervals of rows, shape (s, 2), of intervals of nodes, shape (a, 2)."""
+        if not len(self._others):
+            return nodes
+        more = self._nodes + np.searchsorted(self._others // 256, nodes)
+        return np.concatenate([nodes, more[more[:, 1] > more[:, 0]]])
+
+    def rows(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the rows of some nodes, shape (r,)."""
+        if not len(self._others):
+            return nodes
+        more = self._nodes + np.flatnonzero(np.isin(self._others // 256, nodes))
+        return np.concatenate([nodes, more])
+
+    @property
     def operands(self) -> SmoothingDomains:
-        """Return the rows of the present nodes, for `add_smoothed_forces`."""
-        n, d = self._mesh.node_count, self._domains
-        return d._replace(
-            start=d.start[:n],
-            used=d.used[:n],
-            room=d.room[:n],
-            volume=d.volume[:n],
-            rotation=d.rotation[:n],
-        )
+        """Return the present rows, for `add_smoothed_forces`."""
+        d, r = self._domains, self.count
+        return d._replace(**{name: getattr(d, name)[:r] for name in _BY_ROW})

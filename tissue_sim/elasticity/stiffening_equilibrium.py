@@ -120,12 +120,13 @@ def _kinds(model: ElasticModel) -> list[_Points]:
     """Return the smoothing domains and the elements of a model."""
     o, mesh = model.operands(), model.mesh
     d, law, n = o.domains, o.law, model.mesh.node_count
+    count = len(d.used)
     slot = np.concatenate([np.arange(a, a + c) for a, c in zip(d.start, d.used, strict=True)])
-    node = np.repeat(np.arange(n), d.used)
-    rows = (3 * node[:, None] + np.arange(3)).ravel()
+    row = np.repeat(np.arange(count), d.used)
+    rows = (3 * row[:, None] + np.arange(3)).ravel()
     columns = np.repeat(d.columns[slot].astype(np.int64) // 3, 3)
     values = d.vectors.reshape(-1, 3)[slot].ravel()
-    smooth = csr_matrix((values, (rows, columns)), shape=(3 * n, n))
+    smooth = csr_matrix((values, (rows, columns)), shape=(3 * count, n))
     tets = mesh.tetrahedra.astype(np.int64)
     edges = np.moveaxis(mesh.rest[tets[:, 1:]] - mesh.rest[tets[:, :1]], 1, 2)
     inner = np.linalg.inv(edges)
@@ -133,9 +134,10 @@ def _kinds(model: ElasticModel) -> list[_Points]:
     rows = (3 * np.arange(len(tets))[:, None, None] + np.arange(3)) + np.zeros((1, 4, 1), int)
     columns = np.repeat(tets.ravel(), 3)
     own = csr_matrix((g.ravel(), (rows.ravel(), columns)), shape=(3 * len(tets), n))
+    weight = mesh.volumes() * mesh.by_region(model.material.relative_stiffness)
     return [
         _Points(smooth, d.volume.copy(), law.domains, float(law.tolerance[0])),
-        _Points(own, mesh.volumes(), law.elements, float(law.tolerance[1])),
+        _Points(own, weight, law.elements, float(law.tolerance[1])),
     ]
 
 

@@ -25,6 +25,10 @@ from cutting_trainer.tissue_sim.elasticity.simd import (
     total,
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, grown
+from cutting_trainer.tissue_sim.mesh.topology import of_region
+
+ONE_MATERIAL = np.ones(1)
+"""Relative stiffness by region of a tissue of one material."""
 
 
 class Tensors(NamedTuple):
@@ -191,7 +195,7 @@ def _edge_slot(tensors, filled, node, column):
 
 
 @kernel
-def gather_rows(tensors, filled, links, rest, nodes, lame_lambda, lame_mu):
+def gather_rows(tensors, filled, links, rest, nodes, lame_lambda, lame_mu, relative):
     """Compute the rows of some nodes from their elements.
 
     Thesis eq. 4.7, transposed as it must be:
@@ -205,6 +209,7 @@ def gather_rows(tensors, filled, links, rest, nodes, lame_lambda, lame_mu):
         rest: rest positions [m], shape (n, 3).
         nodes: which rows, shape (r,).
         lame_lambda, lame_mu: [Pa].
+        relative: stiffness by region, relative to these.
 
     Returns:
         Index into `nodes` of the first whose row does not fit in the arrays, or -1.
@@ -218,7 +223,9 @@ def gather_rows(tensors, filled, links, rest, nodes, lame_lambda, lame_mu):
         corner = links.first_corner[node]
         while corner >= 0:
             tet, a = corner // 4, corner % 4
-            volume = shape_gradients(rest, links.tetrahedra, tet, g)
+            volume = shape_gradients(rest, links.tetrahedra, tet, g) * of_region(
+                links, tet, relative
+            )
             dot = volume * lame_mu * (g[a, 0] * g[a, 0] + g[a, 1] * g[a, 1] + g[a, 2] * g[a, 2])
             both = volume * (lame_lambda + lame_mu)
             tensors.diagonal[node, 0] += both * g[a, 0] * g[a, 0] + dot
@@ -303,10 +310,18 @@ class TensorMass:
     Args:
         mesh: the mesh; followed by `update`.
         lame_lambda, lame_mu: [Pa].
+        relative: stiffness by region, relative to these.
     """
 
-    def __init__(self, mesh: TetMesh, lame_lambda: float, lame_mu: float) -> None:
+    def __init__(
+        self,
+        mesh: TetMesh,
+        lame_lambda: float,
+        lame_mu: float,
+        relative: np.ndarray = ONE_MATERIAL,
+    ) -> None:
         self._mesh = mesh
+        self._relative = relative
         self._lame = (lame_lambda, lame_mu)
         n = self._mesh.node_count
         room = np.zeros(n, np.int64)
@@ -356,8 +371,9 @@ class TensorMass:
         mesh, remaining = self._mesh, nodes
         while len(remaining):
             full = gather_rows(
-                self.tensors, self._filled, mesh.links, mesh.rest, remaining, *self._lame
-            )
+                self.tensors, self._filled, mesh.links, mesh.rest, remaining, *self._lame,
+                self._relative,
+            )  # fmt: skip
             if full < 0:
                 return
             remaining = remaining[full:]

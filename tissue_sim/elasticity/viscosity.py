@@ -289,8 +289,11 @@ class Viscosity:
         self._law = np.array([m.lame_mu, 0.0, m.lame_lambda, m.stiffening])
         self._kind = LAW if model.lawful else TURNING if model.rotating else LINEAR
         self._own = None
-        if model.smoothing is None:
-            self._own = NodalSmoothing(model.mesh, m.lame_lambda, m.lame_mu)
+        if model.smoothing is None or len(model.mesh.regions):
+            # One state by node: where regions meet, that of their mean strain by stiffness. What
+            # relaxes is then never more than the elements store.
+            constants = m.lame_lambda, m.lame_mu, m.relative_stiffness
+            self._own = NodalSmoothing(model.mesh, *constants, split=False)
         terms = np.zeros((n, KEPT * len(self._series)))
         self.nodes = ViscousNodes(
             terms, np.zeros((n, 9)), np.zeros(n), np.zeros(n), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))

@@ -17,7 +17,22 @@ from cutting_trainer.node_common.scene_reader import missing_file
 _log = logging.getLogger(__name__)
 
 
+_LABELS = ('gmsh:physical', 'medit:ref', 'cell_tags', 'region', 'label')
+"""Names of the data of cells that say to which region they belong, the first that a file has."""
+
+
 def load_mesh(path: Path, unit_scale: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Read the four-node tetrahedra of a file, without their labels.
+
+    Arguments, result and errors: see `load_labelled_mesh`.
+    """
+    nodes, tetrahedra, _ = load_labelled_mesh(path, unit_scale)
+    return nodes, tetrahedra
+
+
+def load_labelled_mesh(
+    path: Path, unit_scale: float
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
     """Read the four-node tetrahedra of a file.
 
     All blocks of tetrahedra become one, in the file's order. Points, lines and surface elements are
@@ -29,7 +44,8 @@ def load_mesh(path: Path, unit_scale: float) -> tuple[NDArray[np.float64], NDArr
         unit_scale: metres per unit of the file.
 
     Returns:
-        nodes [m], shape (n, 3), and tetrahedra, shape (m, 4), not yet checked by `check_mesh`.
+        nodes [m], shape (n, 3), and tetrahedra, shape (m, 4), not yet checked by `check_mesh`;
+        their labels, such as physical groups of Gmsh, shape (m,): 0 where the file has none.
 
     Raises:
         MeshError: the file is unreadable or has elements other than such tetrahedra.
@@ -57,7 +73,7 @@ def load_mesh(path: Path, unit_scale: float) -> tuple[NDArray[np.float64], NDArr
             points[orphans[0]].tolist(),
         )
     renumbered = np.cumsum(used, dtype=np.int32) - 1
-    return points[used] * unit_scale, renumbered[tetrahedra].astype(np.int32)
+    return points[used] * unit_scale, renumbered[tetrahedra].astype(np.int32), _labels(path, mesh)
 
 
 def _read(path: Path) -> Any:
@@ -100,3 +116,22 @@ def _tetrahedra(path: Path, mesh: Any) -> NDArray[np.int64]:
         _log.info('%s: ignored beside the tetrahedra: %s', path, ignored)
     blocks = [b.data for b in mesh.cells if b.type == 'tetra' and len(b.data)]
     return np.concatenate(blocks).astype(np.int64)
+
+
+def _labels(path: Path, mesh: Any) -> NDArray[np.int64]:
+    """Return the labels of the tetrahedra; 0 where the file has none."""
+    wanted = [i for i, b in enumerate(mesh.cells) if b.type == 'tetra' and len(b.data)]
+    for name in _LABELS:
+        if name in mesh.cell_data:
+            values = np.concatenate([np.asarray(mesh.cell_data[name][i]).ravel() for i in wanted])
+            labels = values.astype(np.int64)
+            if (
+                len(labels) != sum(len(mesh.cells[i].data) for i in wanted)
+                or (labels != values).any()
+            ):
+                raise MeshError(
+                    f'{path}: the data {name} of the cells are no labels: each tetrahedron needs '
+                    'one whole number'
+                )
+            return np.asarray(labels)
+    return np.zeros(sum(len(mesh.cells[i].data) for i in wanted), np.int64)

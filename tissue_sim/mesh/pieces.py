@@ -83,6 +83,10 @@ class PieceRegister:
             self._label[part == p] = number
         return [_piece(number, self._label, tissue, positions) for number in new]
 
+    def nodes_of(self, number: int) -> NDArray[np.int64]:
+        """Return the nodes of a piece at the last call of `find_new`, shape (p,)."""
+        return np.flatnonzero(self._label == number)
+
 
 def pieces_of(tissue: Tissue, positions: Floats) -> list[Piece]:
     """Return all pieces, numbered by their first nodes.

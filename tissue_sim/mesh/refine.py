@@ -23,14 +23,15 @@ def refined(mesh: TetMesh) -> TetMesh:
     middle = mesh.node_count + place.reshape(6, len(tets)).T
     rest = np.concatenate([mesh.rest, mesh.rest[edges].mean(axis=1)])
     fixed = np.concatenate([mesh.fixed, mesh.fixed[edges].min(axis=1)])
-    return TetMesh(rest, _children(rest, tets, middle), fixed)
+    children, parents = _children(rest, tets, middle)
+    return TetMesh(rest, children, fixed, mesh.regions_at(parents))
 
 
 def _children(
     rest: NDArray[np.float64], tets: NDArray[np.int64], middle: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Return the eight children of each tetrahedron, positively oriented; `middle` has the edges in
-    the order of `_EDGES`.
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the eight children of each tetrahedron, positively oriented, and their parents;
+    `middle` has the edges in the order of `_EDGES`.
     """
     corners = [
         np.column_stack([tets[:, i], *(middle[:, e] for e, edge in enumerate(_EDGES) if i in edge)])
@@ -42,13 +43,14 @@ def _children(
         [np.linalg.norm(rest[middle[:, a]] - rest[middle[:, b]], axis=1) for a, b in cycles], axis=1
     )
     shortest = diagonals.argmin(axis=1)
-    inner = []
+    inner, parents = [], [np.arange(len(tets))] * 4
     for which, ((a, b), ring) in enumerate(cycles.items()):
         at = middle[shortest == which]
+        parents += [np.flatnonzero(shortest == which)] * 4
         for i in range(4):
             inner.append(at[:, [a, b, ring[i], ring[(i + 1) % 4]]])
     children = np.concatenate([*corners, *inner])
     p, q, r, s = (rest[children[:, i]] for i in range(4))
     negative = np.einsum('ij,ij->i', np.cross(q - p, r - p), s - p) < 0
     children[negative, 2:] = children[negative, :1:-1]
-    return children
+    return children, np.concatenate(parents)

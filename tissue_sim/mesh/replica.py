@@ -57,6 +57,7 @@ class MeshReplica:
         self._tetrahedra = np.zeros((0, 4), np.int32)
         self._triangles = np.zeros((0, 3), np.int32)
         self._kind = np.zeros(0, np.uint8)
+        self._region = np.zeros(0, np.uint8)
 
     @property
     def rest(self) -> np.ndarray:
@@ -88,6 +89,11 @@ class MeshReplica:
         """OUTER or CUT by surface triangle, shape (k,); a view."""
         return self._kind[: self._tris]
 
+    @property
+    def regions(self) -> np.ndarray:
+        """Row of the table of materials by tetrahedron, shape (m,), (0,) with one; a view."""
+        return self._region[: self._tets]
+
     def positions(self) -> np.ndarray:
         """Return current positions [m], shape (n, 3); a new array."""
         return self.rest + self.displacement
@@ -98,7 +104,7 @@ class MeshReplica:
         Raises:
             MeshError: the received arrays are no valid mesh.
         """
-        mesh = TetMesh(self.rest, self.tetrahedra, self.fixed)
+        mesh = TetMesh(self.rest, self.tetrahedra, self.fixed, self.regions)
         if len(mesh.triangles) != self._tris:
             text = f'{self._tris} surface triangles were sent, the tetrahedra have'
             raise MeshError(f'{text} {len(mesh.triangles)}')
@@ -123,11 +129,13 @@ class MeshReplica:
         self._require_size(n, len(mesh.tetrahedra) // 4, len(mesh.triangles) // 3)
         tets = _indices(mesh.tetrahedra, 4, n, 'tetrahedra')
         tris = _indices(mesh.triangles, 3, n, 'triangles')
+        region = np.array(getattr(mesh, 'region', ()), np.uint8)  # an old bag has none
         lengths = (
             ('rest', remainder, 0),
             ('displacement', len(mesh.displacement), 3 * n),
             ('fixed', len(mesh.fixed), n),
             ('triangle_kind', len(mesh.triangle_kind), len(tris)),
+            ('region', len(region), len(tets) if len(region) else 0),
         )
         for name, have, want in lengths:
             if have != want:
@@ -142,6 +150,7 @@ class MeshReplica:
         self._fixed = np.array(mesh.fixed, np.uint8)
         self._tetrahedra, self._triangles = tets, tris
         self._kind = np.array(mesh.triangle_kind, np.uint8)
+        self._region = region
         self.revision, self.topology, self.step = mesh.revision, mesh.topology, mesh.step
 
     def apply(self, delta: Any) -> bool:
@@ -172,6 +181,7 @@ class MeshReplica:
         moved_at = np.arange(n) if everything else _slots(delta.displaced, n, 'displaced')
         tets = _indices(delta.tetrahedra, 4, n, 'tetrahedra')
         tris = _indices(delta.triangles, 3, n, 'triangles')
+        region = np.array(getattr(delta, 'region', ()), np.uint8)
         lengths = (
             ('displacement', len(delta.displacement), 3 * len(moved_at)),
             ('rest', len(delta.rest), 3 * len(rest_at)),
@@ -179,6 +189,7 @@ class MeshReplica:
             ('tetrahedra', len(tets), len(tets_at)),
             ('triangles', len(tris), len(tris_at)),
             ('triangle_kind', len(delta.triangle_kind), len(tris_at)),
+            ('region', len(region), len(tets_at) if len(self._region) else 0),
         )
         for name, have, want in lengths:
             if have != want:
@@ -189,6 +200,8 @@ class MeshReplica:
         self._rest[rest_at] = rest
         self._fixed[rest_at] = np.array(delta.fixed, np.uint8)
         self._tetrahedra[tets_at] = tets
+        if len(self._region):
+            self._region[tets_at] = region
         self._triangles[tris_at] = tris
         self._kind[tris_at] = np.array(delta.triangle_kind, np.uint8)
         self._displacement[moved_at] = moved
@@ -224,6 +237,7 @@ class MeshReplica:
         self._tetrahedra = grown(self._tetrahedra, m)
         self._triangles = grown(self._triangles, k)
         self._kind = grown(self._kind, k)
+        self._region = grown(self._region, m) if len(self._region) else self._region
         self._nodes, self._tets, self._tris = n, m, k
 
 

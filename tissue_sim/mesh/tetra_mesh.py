@@ -39,6 +39,7 @@ class TopologyDelta:
         tetrahedra: nodes of the new ones; new nodes count on from the node count, shape (c, 4).
         outer_faces: bit f of a new tetrahedron: its face opposite node f, where free, belongs to
             the original surface, shape (c,).
+        regions: of the new ones, shape (c,); (0,) in a tissue of one material.
     """
 
     node_parents: np.ndarray = field(default_factory=_no_parents)
@@ -49,6 +50,7 @@ class TopologyDelta:
     removed_tetrahedra: np.ndarray = field(default_factory=_no_indices)
     tetrahedra: np.ndarray = field(default_factory=_no_parents)
     outer_faces: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
+    regions: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
 
     @property
     def empty(self) -> bool:
@@ -85,13 +87,18 @@ class TetMesh:
         rest: rest positions [m], shape (n, 3).
         tetrahedra: node indices, positively oriented, shape (m, 4).
         fixed: which nodes do not move, shape (n,).
+        regions: row of the table of materials by tetrahedron, shape (m,); (0,): one material.
 
     Raises:
         MeshError: a face belongs to more than two tetrahedra.
     """
 
     def __init__(
-        self, rest: np.ndarray, tetrahedra: np.ndarray, fixed: np.ndarray | None = None
+        self,
+        rest: np.ndarray,
+        tetrahedra: np.ndarray,
+        fixed: np.ndarray | None = None,
+        regions: np.ndarray | None = None,
     ) -> None:
         self.node_count = len(rest)
         # Spare room: the first cut of a large mesh does not have to move it all.
@@ -100,9 +107,10 @@ class TetMesh:
         self._fixed = grown(
             np.zeros(len(rest), np.uint8) if fixed is None else np.array(fixed, np.uint8), n
         )
-        self.links = _allocate(n, m + m // 4, 4 * m, 16 * m + 64)
+        own = np.zeros(0, np.uint8) if regions is None else np.asarray(regions, np.uint8)
+        self.links = _allocate(n, m + m // 4, 4 * m, 16 * m + 64, len(own) > 0)
         order = np.ascontiguousarray(tetrahedra, np.int64)
-        bad = append_tetrahedra(self.links, order, np.full(m, 15, np.uint8))
+        bad = append_tetrahedra(self.links, order, np.full(m, 15, np.uint8), own)
         if bad >= 0:
             raise MeshError(
                 f'tetrahedron {bad} with nodes {order[bad].tolist()} is the third on one of its '
@@ -158,6 +166,25 @@ class TetMesh:
         """Face (4 t + i) of each surface triangle, shape (k,); a view."""
         return self.links.triangle_face[: self.links.counts[1]]
 
+    @property
+    def regions(self) -> np.ndarray:
+        """Row of the table of materials by tetrahedron, shape (m,), uint8; a view.
+
+        A tissue of one material has none, shape (0,).
+        """
+        return self.links.region[: self.links.counts[0]]
+
+    def regions_at(self, tetrahedra: np.ndarray) -> np.ndarray:
+        """Return the regions of some tetrahedra, shape (r,); (0,) with one material."""
+        return self.regions[tetrahedra] if len(self.regions) else self.regions
+
+    def by_region(self, values: np.ndarray) -> np.ndarray:
+        """Return values by tetrahedron, shape (m,), of values by region."""
+        regions = self.regions
+        if len(regions):
+            return np.asarray(values[regions])
+        return np.full(len(self.tetrahedra), values[0])
+
     def volumes(self) -> np.ndarray:
         """Return signed rest volumes [m^3], shape (m,)."""
         return tetrahedron_volumes(self.rest, self.tetrahedra)
@@ -185,7 +212,8 @@ class TetMesh:
         self._reserve(len(removed), len(added), len(old_nodes))
         self.links.counts[2] = 0
         remove_tetrahedra(self.links, removed)
-        bad = append_tetrahedra(self.links, added, np.asarray(delta.outer_faces, np.uint8))
+        outer, own = np.asarray(delta.outer_faces, np.uint8), np.asarray(delta.regions, np.uint8)
+        bad = append_tetrahedra(self.links, added, outer, own)
         if bad >= 0:
             raise MeshError(
                 f'new tetrahedron {bad} with nodes {added[bad].tolist()} would be the third '
@@ -211,6 +239,12 @@ class TetMesh:
             if array.size and (array.min() < 0 or array.max() >= limit):
                 worst = array.max() if array.max() >= limit else array.min()
                 raise MeshError(f'{name} has index {worst}; allowed are 0 to {limit - 1}')
+        if len(self.regions):
+            given, wanted = len(delta.regions), len(delta.tetrahedra)
+            if given != wanted or not np.isin(delta.regions, self.regions).all():
+                raise MeshError(
+                    f'{wanted} new tetrahedra have {given} regions; each needs one of the mesh'
+                )
 
     def _interpolate_nodes(self, delta: TopologyDelta, moved: np.ndarray) -> None:
         n, a = self.node_count, len(delta.node_parents)
@@ -243,6 +277,7 @@ class TetMesh:
             grown(links.triangle_face, triangles),
             grown(links.triangle_kind, triangles),
             grown(links.log, log),
+            grown(links.region, tets) if len(links.region) else links.region,
         )
 
     def _drop_orphans(self, nodes: np.ndarray) -> list[tuple[int, int]]:
@@ -351,7 +386,7 @@ def grown(array: np.ndarray, size: int, *, fill: int = 0) -> np.ndarray:
     return larger
 
 
-def _allocate(nodes: int, tets: int, triangles: int, log: int) -> Links:
+def _allocate(nodes: int, tets: int, triangles: int, log: int, labelled: bool) -> Links:
     return Links(
         np.zeros(3, np.int64),
         np.zeros((tets, 4), np.int32),
@@ -364,4 +399,5 @@ def _allocate(nodes: int, tets: int, triangles: int, log: int) -> Links:
         np.zeros(triangles, np.int32),
         np.zeros(triangles, np.uint8),
         np.zeros(log, np.int64),
+        np.zeros(tets if labelled else 0, np.uint8),
     )

@@ -31,6 +31,7 @@ class Links(NamedTuple):
         triangle_face: face of each surface triangle, shape (k,).
         triangle_kind: OUTER or CUT, shape (k,).
         log: slots written: tetrahedron t as 2 t, triangle k as 2 k + 1.
+        region: row of the table of materials by tetrahedron, shape (m,); (0,): one material.
     """
 
     counts: np.ndarray
@@ -44,6 +45,13 @@ class Links(NamedTuple):
     triangle_face: np.ndarray
     triangle_kind: np.ndarray
     log: np.ndarray
+    region: np.ndarray
+
+
+@inner
+def of_region(links, tet, values):
+    """Return the value of a tetrahedron's region, of values by region."""
+    return values[links.region[tet]] if links.region.shape[0] > 0 else values[0]
 
 
 @inner
@@ -162,6 +170,8 @@ def _unlink(links, tet):
 
 @inner
 def _move(links, source, target):
+    if links.region.shape[0] > 0:
+        links.region[target] = links.region[source]
     for i in range(4):
         links.tetrahedra[target, i] = links.tetrahedra[source, i]
         links.neighbors[target, i] = links.neighbors[source, i]
@@ -201,13 +211,14 @@ def remove_tetrahedra(links, descending):
 
 
 @kernel
-def append_tetrahedra(links, added, outer_faces):
+def append_tetrahedra(links, added, outer_faces, regions):
     """Append tetrahedra.
 
     Args:
         links: connectivity, with room for them.
         added: node indices, positively oriented, shape (a, 4).
         outer_faces: bit f set: the face opposite node f, where free, is OUTER, shape (a,).
+        regions: of each, shape (a,); not read where there is one material.
 
     Returns:
         Index into `added` of the first one that would be the third on a face, or -1.
@@ -217,6 +228,8 @@ def append_tetrahedra(links, added, outer_faces):
         links.counts[0] = tet + 1
         for i in range(4):
             links.tetrahedra[tet, i] = added[a, i]
+        if links.region.shape[0] > 0:
+            links.region[tet] = regions[a]
         _note(links, 2 * tet)
         if not _link(links, tet, outer_faces[a]):
             return a

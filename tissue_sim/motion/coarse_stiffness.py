@@ -275,8 +275,8 @@ class CoarseStiffness:
         self._rows[nodes] = sign > 0.0
         if len(o.rows.used):
             self._all(_add_rows, o.rows, nodes, sign)
-        if len(o.domains.used):
-            self._all(_add_domains, o.domains, nodes, sign)
+        if self._model.smoothing is not None:
+            self._all(_add_domains, o.domains, self._model.smoothing.rows(nodes), sign)
 
     def _add_chunks(self, chunks: np.ndarray, sign: float) -> None:
         self._chunks[chunks] = sign > 0.0

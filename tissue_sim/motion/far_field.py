@@ -89,11 +89,11 @@ def _rank(rest, centre, out):
 
 @kernel(error_model='numpy')
 def _strain_domains(domains, u, out):
-    """Write the squares of F - I of smoothing domains, shape (n,)."""
-    for node in range(len(out)):
-        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = smoothed_gradient(domains, u, node)
-        out[node] = xx * xx + xy * xy + xz * xz + yx * yx + yy * yy + yz * yz
-        out[node] += zx * zx + zy * zy + zz * zz
+    """Write the squares of F - I of smoothing domains, shape (r,)."""
+    for row in range(len(out)):
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = smoothed_gradient(domains, u, row)
+        out[row] = xx * xx + xy * xy + xz * xz + yx * yx + yy * yy + yz * yz
+        out[row] += zx * zx + zy * zy + zz * zz
 
 
 @kernel(error_model='numpy')
@@ -346,8 +346,10 @@ class FarField:
         out = np.zeros(len(inverse_mass) // 3)
         if self._model.rotating:
             operands = self._model.operands()
-            if len(operands.domains.used):
-                _strain_domains(operands.domains, u, out)
+            if self._model.smoothing is not None:
+                strains = np.zeros(len(operands.domains.used))
+                _strain_domains(operands.domains, u, strains)
+                np.maximum.at(out, self._model.smoothing.row_nodes, strains)
             else:
                 _strain_elements(operands.elements, u, out)
             out[inverse_mass[::3] == 0.0] = 0.0

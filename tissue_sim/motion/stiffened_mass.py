@@ -102,7 +102,7 @@ class StiffenedMass:
         if len(self._rows) != n:
             self._rows, self._squared = np.zeros(n), np.zeros(n)
         self._rows[:] = self._linear
-        parts = o.law, o.domains, o.elements, o.awake, o.chunks
+        parts = o.law, o.domains, o.elements, o.spans, o.chunks
         add_tangent_rows(*parts, u, self._rows, self._strain)
         _squared(self._rows, self._linear, self._model.mass, _HEADROOM * self._scale, self._squared)
         return self._squared

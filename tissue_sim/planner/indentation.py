@@ -129,4 +129,5 @@ def surroundings(
     held = mesh.fixed.copy()
     held[mesh.tetrahedra[~kept].ravel()] = 1
     nodes, tetrahedra = np.unique(mesh.tetrahedra[kept].astype(np.int64), return_inverse=True)
-    return TetMesh(mesh.rest[nodes], tetrahedra.reshape(-1, 4), held[nodes])
+    regions = mesh.regions_at(np.flatnonzero(kept))
+    return TetMesh(mesh.rest[nodes], tetrahedra.reshape(-1, 4), held[nodes], regions)

@@ -61,7 +61,7 @@ def _key(task: Task) -> str:
     """Return the hash of mesh, section, budget, code and processor."""
     mesh, code = task.mesh, identity_here()
     total = hashlib.sha256()
-    for array in (mesh.rest, mesh.tetrahedra, mesh.fixed):
+    for array in (mesh.rest, mesh.tetrahedra, mesh.fixed, mesh.regions):
         total.update(f'{array.dtype} {array.shape}\n'.encode() + array.tobytes())
     parts = (task.material, task.resistance, task.budget, task.stepping, task.model)
     libraries = (code.kernels, code.python, code.numba, code.numpy, code.cpu, code.features)

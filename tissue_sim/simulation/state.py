@@ -142,6 +142,7 @@ def shape_of(simulation: TissueSimulation) -> MeshReplica:
             tetrahedra=m.tetrahedra.ravel(),
             triangles=m.triangles.ravel(),
             triangle_kind=m.triangle_kind,
+            region=m.regions,
             revision=0,
             topology=m.topology,
             step=simulation.step,

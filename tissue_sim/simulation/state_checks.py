@@ -81,6 +81,7 @@ def check_mesh(mesh: TetMesh) -> None:
         ('triangle_face', k),
         ('triangle_kind', k),
         ('log', logged),
+        ('region', slots if len(links.region) else 0),
     ):
         has_room(name, getattr(links, name), rows, *columns)
     has_room('rest', mesh._rest, n, 3)
@@ -144,6 +145,10 @@ def check_simulation(simulation: TissueSimulation) -> None:
     _check_loads(dynamics, n)
     if dynamics._stiffened is not None:
         has_room('_linear', dynamics._stiffened._linear, n)
+    regions = len(model.material.relative_stiffness)
+    within('region', mesh.regions, regions)
+    if simulation._blade is not None and len(simulation._resistance.regions) + 1 < regions:
+        raise StateError('regions of the tissue have no resistance to the blade')
     _check_model(model, n)
     _check_estimates(simulation, n)
     if dynamics._far is None:
@@ -169,8 +174,7 @@ def _check_loads(dynamics: Any, n: int) -> None:
     for name, columns in zip(ViscousNodes._fields, shapes, strict=True):
         has_room(name, getattr(viscosity.nodes, name), n, *columns)
     if viscosity._own is not None:
-        _check_domains(viscosity._own._domains, n, 3 * n - 2)
-        _check_room('domains', viscosity._own._domains, viscosity._own._filled, n)
+        _check_smoothing(viscosity._own, n)
 
 
 def _check_model(model: Any, n: int) -> None:
@@ -183,9 +187,7 @@ def _check_model(model: Any, n: int) -> None:
         has_room('diagonal', t.diagonal, n, 6)
         _check_room('tensors', t, model.tensor_mass._filled, n)
     if isinstance(model._domains, NodalSmoothing):
-        d = model._domains._domains
-        _check_domains(d, n, 3 * n - 2)
-        _check_room('domains', d, model._domains._filled, n)
+        _check_smoothing(model._domains, n)
     if model._elements is not None:
         elements = model._elements
         within('elements', [elements._count], len(model.mesh.tetrahedra) + 1)
@@ -228,6 +230,13 @@ def _check_room(label: str, rows: Any, filled: np.ndarray, n: int) -> None:
     within(f'the room of {label}', (rows.start[:n] + room)[room > 0], slots + 1)
     if (rows.used[:n] > room).any():
         raise StateError(f'a row of {label} is longer than its room')
+
+
+def _check_smoothing(smoothing: NodalSmoothing, n: int) -> None:
+    within('nodes of domains', [smoothing._nodes], n + 1, n)
+    within('regions of nodes', smoothing._others, 256 * n)
+    _check_domains(smoothing._domains, smoothing.count, 3 * n - 2)
+    _check_room('domains', smoothing._domains, smoothing._filled, smoothing.count)
 
 
 def _check_domains(domains: SmoothingDomains, n: int, limit: int) -> None:
@@ -360,7 +369,7 @@ def _check_operands(operands: Operands, size: int) -> None:
         within('nodes of rows', [len(rows.used)], size + 1)
     if len(operands.domains.used):
         _check_domains(operands.domains, len(operands.domains.used), limit)
-        within('nodes of domains', [len(operands.domains.used)], size + 1)
+        within('spans', operands.spans, len(operands.domains.used) + 1)
     if len(operands.elements.corners):
         _check_elements(operands.elements, limit)
     if len(operands.law.domains):
@@ -391,6 +400,10 @@ def _check_blade(simulation: TissueSimulation, n: int) -> None:
         has_room(f'{name} of the edge', getattr(edge, name), POINTS, width)
     has_room('spans of the edge', edge.spans, POINTS)
     has_room('hint of the edge', edge.hint, 1)
+    has_room('region of the edge', edge.region, POINTS)
+    within('region of the edge', edge.region, len(blade._law.toughness))
+    for name in ('friction', 'at_tip'):
+        has_room(f'{name} of the blade', getattr(blade._law, name), len(blade._law.toughness))
     within('corners of the blade', edge.corners, n)
     has_room('strips of the blade', strips.knots, MAX_STRIPS, 2, KNOTS, 3)
     has_room('counts of the strips', strips.counts, 2)

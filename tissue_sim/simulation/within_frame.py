@@ -121,12 +121,20 @@ class ToolInFrame:
         if spring.mode != PUSH or self._contact.mode == ToolMode.PALPATOR:
             return False
         pressed = float(np.linalg.norm(spring.force(positions, share)))
-        at_tip = self._resistance.toughness * self._resistance.tip_width
+        at_tip = self._toughness() * self._resistance.tip_width
         if at_tip == 0.0:
             return pressed >= self._resistance.threshold
         tip = -float(self._device(share)[1] @ spring.normal)
         self.dent = self.dent.deepened(pressed, tip - pressed / self._contact.stiffness)
         return self.dent.work >= at_tip * self.dent.depth > 0.0
+
+    def _toughness(self) -> float:
+        """Return the toughness of the region that the tool touches [J/m^2]."""
+        regions, resistance = self._mesh.regions, self._resistance
+        number = (
+            int(regions[self._mesh.star(int(self._contact.nodes[0]))[0]]) if len(regions) else 0
+        )
+        return resistance.regions[number - 1][0] if number else resistance.toughness
 
     def _follow(self, share: float, positions: np.ndarray) -> None:
         assert self.blade is not None

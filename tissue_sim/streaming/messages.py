@@ -55,6 +55,7 @@ def mesh_message(
     message.tetrahedra = packed('I', mesh.tetrahedra)
     message.triangles = packed('I', mesh.triangles)
     message.triangle_kind = packed('B', mesh.triangle_kind)
+    message.region = packed('B', mesh.regions)
     message.state_hash = state_hash(mesh.rest, displacement, mesh.tetrahedra)
     return message
 
@@ -124,6 +125,7 @@ class DeltaEncoder:
         message.fixed = packed('B', mesh.fixed[touched.rest])
         message.tetrahedra_changed = packed('I', touched.tetrahedra)
         message.tetrahedra = packed('I', mesh.tetrahedra[touched.tetrahedra])
+        message.region = packed('B', mesh.regions_at(touched.tetrahedra))
         message.triangles_changed = packed('I', touched.triangles)
         message.triangles = packed('I', mesh.triangles[touched.triangles])
         message.triangle_kind = packed('B', mesh.triangle_kind[touched.triangles])
@@ -204,6 +206,7 @@ def delta_into(message: Any, delta: TopologyDelta) -> None:
     message.removed_tetrahedra = packed('I', delta.removed_tetrahedra)
     message.tetrahedra = packed('I', delta.tetrahedra)
     message.outer_faces = packed('B', delta.outer_faces)
+    message.regions = packed('B', delta.regions)
 
 
 def delta_from(message: Cut.Response) -> TopologyDelta:
@@ -228,6 +231,7 @@ def delta_from(message: Cut.Response) -> TopologyDelta:
         removed_tetrahedra=array_of('removed_tetrahedra', np.int64, 1),
         tetrahedra=array_of('tetrahedra', np.int64, 4),
         outer_faces=array_of('outer_faces', np.uint8, 1),
+        regions=array_of('regions', np.uint8, 1),
     )
     pairs = (
         ('node_weights', delta.node_weights, delta.node_parents),
