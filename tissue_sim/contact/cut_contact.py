@@ -273,7 +273,7 @@ class CutContact:
         return bool((self._mesh.triangle_kind == CUT).any())
 
     def find(self, u: np.ndarray, v: np.ndarray, dt: float, substeps: int) -> tuple[NearFaces, int]:
-        """Return what is near now, and for how many substeps that is known.
+        """Return the contacts that are near now, and for how many substeps they are known.
 
         Args:
             u, v: displacement [m] and velocity [m/s], shape (n, 3).
@@ -309,7 +309,7 @@ class CutContact:
         return faces
 
     def keep(self, contacts: NearFaces, faces: CutContacts) -> None:
-        """Keep the forces that the kernels have found, and what was lost."""
+        """Keep the forces that the kernels have found, and the energy lost."""
         self._pull[contacts.nodes[:, 0]] = faces.pulls
         self.lost, faces.scalars[1] = self.lost + float(faces.scalars[1]), 0.0
 

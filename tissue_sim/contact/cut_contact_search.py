@@ -30,7 +30,7 @@ _BESIDE = 0.05
 
 
 class NearFaces(NamedTuple):
-    """Nodes of cut faces and what they meet, until the next search.
+    """Nodes of cut faces and the triangles that they meet, until the next search.
 
     Attributes:
         nodes: the node, and those of the triangle, shape (c, 4).

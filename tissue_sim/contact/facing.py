@@ -39,7 +39,7 @@ class Law(NamedTuple):
 
 
 class Held(NamedTuple):
-    """The blade as it is held, and what it carries along.
+    """The blade as it is held, and its hold on the tissue.
 
     Attributes:
         direction: unit vector from tip to root, shape (3,).
