@@ -215,7 +215,9 @@ def _report(
     volumes = task.mesh.volumes()
     frame = make_simulation(scene.tissue)[0].frame(None)
     border = nodes[np.unique(task.mesh.triangles)]
-    warnings = _warnings(len(tetrahedra), float(measured.radius_ratio.min()), frame, surface)
+    meshed = not is_volume(options.surface)
+    worst = float(measured.radius_ratio.min())
+    warnings = _warnings(len(tetrahedra), worst, frame, surface, meshed=meshed)
     return Report(
         surface=str(options.surface),
         watertight=True,
@@ -279,8 +281,17 @@ def _require_same_border(
             )
 
 
-def _warnings(tetrahedra: int, worst: float, frame: Frame, surface: Surface) -> list[str]:
+def _warnings(
+    tetrahedra: int, worst: float, frame: Frame, surface: Surface, *, meshed: bool
+) -> list[str]:
+    """Return sentences; the remedy depends on whether the tetrahedra were made here."""
     warnings = []
+    coarser = 'import it with a larger --edge' if meshed else 'make the mesh coarser'
+    again = (
+        'import it again, the mesher does not make the same mesh twice'
+        if meshed
+        else 'mend the mesh there'
+    )
     if surface.size.max() > MAX_USUAL_SIZE_M:
         warnings.append(f'it is {surface.size.max():.2g} m long: is the unit right (--unit)?')
     if surface.parts > 1:
@@ -288,17 +299,17 @@ def _warnings(tetrahedra: int, worst: float, frame: Frame, surface: Surface) -> 
     if tetrahedra > MAX_REAL_TIME_TETRAHEDRA:
         warnings.append(
             f'{tetrahedra} tetrahedra: 30 Hz is not to be expected above '
-            f'{MAX_REAL_TIME_TETRAHEDRA}; import it with a larger --edge'
+            f'{MAX_REAL_TIME_TETRAHEDRA}; {coarser}'
         )
     if worst < 0.05:
         warnings.append(
             f'the worst element has the radius ratio {worst:.2g} and dictates the time step: '
-            'import it again, the mesher does not make the same mesh twice'
+            f'{again}'
         )
     if frame.slow_motion < 1:
         warnings.append(
             f'{frame.substeps} substeps do not suffice: it would run at {frame.slow_motion:.2g} of '
-            'its speed; take a larger --edge, or raise tissue.integration.max_substeps'
+            f'its speed; {coarser}, or raise tissue.integration.max_substeps'
         )
     return warnings
 

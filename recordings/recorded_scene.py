@@ -51,7 +51,8 @@ def restore_scene(bag: Bag, folder: Path, changes: Mapping[str, str] | None = No
         raise BagError(f'the scene of {bag.path} has no section tissue')
     mesh = first_keyframe(bag)
     cells = [('tetra', np.asarray(mesh.tetrahedra, np.int64).reshape(-1, 4))]
-    meshio.Mesh(np.asarray(mesh.rest).reshape(-1, 3), cells).write(
+    labels = _labels(bag, scene['tissue'], np.array(getattr(mesh, 'region', ()), np.int64))
+    meshio.Mesh(np.asarray(mesh.rest).reshape(-1, 3), cells, cell_data=labels).write(
         folder / MESH_FILE, file_format='vtk'
     )
     _translate(scene)
@@ -70,6 +71,30 @@ def restore_scene(bag: Bag, folder: Path, changes: Mapping[str, str] | None = No
     yaml.dump(scene, out)
     path.write_text(out.getvalue(), encoding='utf-8')
     return path
+
+
+def _labels(bag: Bag, tissue: dict[str, Any], regions: np.ndarray) -> dict[str, Any]:
+    """Return the labels of the tetrahedra as cell data: those that the scene gives the regions.
+
+    Args:
+        bag: for messages.
+        tissue: section of the scene.
+        regions: of the keyframe, 0 or the place in the scene's list from 1; (0,): none.
+    """
+    if not len(regions):
+        return {}
+    listed = tissue.get('regions')
+    try:
+        named = [int(region['label']) for region in listed or ()]
+    except (TypeError, KeyError, ValueError):
+        raise BagError(f'tissue.regions in the scene of {bag.path} is no list of labels') from None
+    if regions.max() > len(named):
+        raise BagError(
+            f'{bag.path} has a mesh of {regions.max() + 1} regions, and a scene with '
+            f'{len(named)} in tissue.regions'
+        )
+    other = next(label for label in range(len(named) + 1) if label not in named)
+    return {'region': [np.array([other, *named])[regions]]}
 
 
 def recorded_contact(bag: Bag) -> str:

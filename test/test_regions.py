@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import meshio
 import numpy as np
@@ -11,10 +12,12 @@ import pytest
 from meshes import box, irregular_box
 
 from bench.cuts.random_strokes import random_stroke, shuffled_box
+from cutting_trainer.bags.errors import BagError
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.mesh_import.import_mesh import ImportOptions, import_mesh
 from cutting_trainer.node_common.errors import MeshError
+from cutting_trainer.recordings import recorded_scene
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import load_tissue, make_task
@@ -394,3 +397,19 @@ def test_the_pad_is_skin_on_fat() -> None:
     low = task.mesh.rest[task.mesh.tetrahedra][:, :, 2].min(axis=1)
     assert np.array_equal(task.mesh.regions == 1, low < 0.011 - 1e-6)
     assert 10 < task.material.youngs_modulus / task.material.regions[0].youngs_modulus < 20
+
+
+def test_the_scene_of_a_bag_has_its_regions_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = load_scene('pad')
+    mesh = make_task(scene.tissue).mesh
+    keyframe = mesh_message(mesh, np.zeros_like(mesh.rest), 'pad', 0, 0, 0)
+    monkeypatch.setattr(recorded_scene, 'first_keyframe', lambda bag: keyframe)
+    text = (Path(__file__).parents[1] / 'config' / 'scenes' / 'pad.yaml').read_text()
+    bag: Any = SimpleNamespace(path=tmp_path, custom_data={'scene': text})
+    restored = load_scene(str(recorded_scene.restore_scene(bag, tmp_path)))
+    assert np.array_equal(make_task(restored.tissue).mesh.regions, mesh.regions)
+    bag.custom_data['scene'] = text.replace('label: 2', 'label: x')
+    with pytest.raises(BagError, match='is no list of labels'):
+        recorded_scene.restore_scene(bag, tmp_path)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.viewer.allowed_requests import Bounds
-from cutting_trainer.viewer.colours import CUT, TISSUE, Colour
+from cutting_trainer.viewer.colours import TISSUE, Colour
 from cutting_trainer.viewer.tool_state import Floats, Moment
 
 Indices = NDArray[np.int64]
@@ -81,7 +81,6 @@ def shown_tissue(
         'name': name,
         'label': label,
         'colour': colour,
-        'cut_colour': CUT,
         'offset': [offset, 0.0, 0.0],
     }
 
