@@ -23,10 +23,12 @@ from cutting_trainer.bags.topic_names import (
     CONTACT,
     FORCE,
     FORCES,
+    MESH,
     OF_DEVICE,
     OF_TISSUE,
     POSE,
     REPLAYED,
+    UPDATES,
 )
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
@@ -167,9 +169,11 @@ class SessionPlayer(Player):
         self.topics = [topic for topic in wanted if topic in bag.topics()]
         self._wrench = WrenchStampedCodec('arm_base')
         self._grown: dict[str, StampedCodec] = {}
+        self._listed: tuple[str, ...] = ()
         if int(bag.custom_data.get('format_version', FORMAT_VERSION)) < FORMAT_VERSION:
             # Their fields that an older bag lacks are added.
             self._grown = {CONTACT: ContactCodec(FRAME), FORCE: ForceSampleCodec(FRAME)}
+            self._listed = (MESH, UPDATES)
         self._stream = RecordedStream(bag, self.topics, start)
         self._rounds = 0
 
@@ -198,6 +202,8 @@ class SessionPlayer(Player):
             elif codec := self._grown.get(message.topic):
                 sample = codec.decode(data)
                 data = codec.encode(sample.stamp_ns, sample.values)
+            elif message.topic in self._listed:
+                data = data + bytes(-len(data) % 4 + 4)  # an empty list of regions, aligned
             self._publishers_by_topic[message.topic].publish(data)
 
     def finish(self) -> None:

@@ -335,7 +335,6 @@ def test_imported_scene_is_pressed_and_cut_by_its_own_script(
 @pytest.mark.parametrize('side', SIDES)
 def test_side_on_which_it_rests_is_turned_down_without_mirroring(side: str) -> None:
     from cutting_trainer.mesh_import.import_mesh import _placed
-    from cutting_trainer.mesh_import.surface_import import Surface
 
     box = trimesh.creation.box([0.04, 0.05, 0.06])
     axis, sign = SIDES[side]
@@ -343,13 +342,12 @@ def test_side_on_which_it_rests_is_turned_down_without_mirroring(side: str) -> N
     tip = np.zeros(3)
     tip[axis] = -sign * 0.02
     vertices = np.vstack((box.vertices, tip))
-    surface = Surface(vertices, np.asarray(box.faces, np.int32), 1.2e-4, 1, ())
-    placed = _placed(surface, side)
-    solid = trimesh.Trimesh(placed.vertices[:8], box.faces, process=False)
+    placed = _placed(vertices, side)
+    solid = trimesh.Trimesh(placed[:8], box.faces, process=False)
     assert solid.volume == pytest.approx(box.volume)
-    assert placed.vertices[:, 2].min() == 0.0
+    assert placed[:, 2].min() == 0.0
     size = [0.04, 0.05, 0.06]
-    assert placed.vertices[8, 2] == pytest.approx(size[axis] / 2 - 0.02)
+    assert placed[8, 2] == pytest.approx(size[axis] / 2 - 0.02)
 
 
 def test_height_is_that_of_the_solid_over_a_place() -> None:
