@@ -53,7 +53,7 @@ def import_mesh(
     ] = '-z',
     as_json: AsJson = False,
 ) -> None:
-    """Fill the surface of an organ with tetrahedra; write a mesh, a quality report, a scene."""
+    """Make mesh, quality report and scene from an organ's surface, or from its tetrahedra."""
     from cutting_trainer.mesh_import.import_mesh import ImportOptions
     from cutting_trainer.mesh_import.import_mesh import import_mesh as make
 

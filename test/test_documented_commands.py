@@ -143,7 +143,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
         'takes minutes: test_pieces.py does it to fewer pieces'
     ),
     './trainer clean': Elsewhere('test_launcher.py::test_clean_leaves_nothing_but_the_lock'),
-    './trainer record -o BAG': Elsewhere(
+    './trainer record -o BAG --scene block': Elsewhere(
         'test_bags_live.py::'
         'test_record_says_of_each_topic_what_came_was_written_was_lost_and_was_sent_before'
     ),
@@ -171,6 +171,14 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     'export ROS_SECURITY_STRATEGY=Enforce ROS_SECURITY_ENCLAVE_OVERRIDE=/trainer': PACKAGED,
     './trainer run PROGRAM ...': Nowhere('PROGRAM stands for what others of these commands run'),
     './trainer probe-device --arm /MTML --profile dvrk_mtm': Nowhere('needs a real arm'),
+    './trainer bridge-side --no-arm --scene block --bag NEW': Nowhere('needs a real arm'),
+    './trainer sim-side --scene block': Nowhere('the other half of a session with a real arm'),
+    './trainer view --attach --scene block': Nowhere(
+        'test_page_is_served_until_ctrl_c runs it with the usual scene'
+    ),
+    './trainer import-mesh organ.msh --unit m -o organs/organ': Nowhere(
+        'test_regions.py imports labelled tetrahedra by the same function'
+    ),
     'sudo apt install python3-venv python3-dev cmake build-essential': Nowhere('system packages'),
     'sudo apt install chromium': Nowhere('a system package; .ci/run installs it likewise'),
     'source .trainer/sourced/env/bin/activate': PACKAGED,

@@ -15,7 +15,8 @@ _PAGE = """# Materials
 Values of `tissue.material.preset`, and the source of each number. A number is read in a table, on
 a page or in an abstract, *computed* from one, *borrowed* from another species, or *chosen* for want
 of a source. A number that was not found is absent. The scene must then give `density`;
-`toughness` has its default of {toughness:g} J/m^2, `stiffening` and `friction` have 0.
+`toughness` has its default of {toughness:g} J/m^2, `stiffening` and `friction` have 0. Beside
+`tissue.regions[].preset` an absent value is that of `tissue.material`.
 
 | preset | key | value | read in | source |
 |---|---|---|---|---|

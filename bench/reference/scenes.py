@@ -111,12 +111,17 @@ def _value(field: FieldInfo, meaning: str) -> str:
         limits = _limits(item.__metadata__[0].metadata) if hasattr(item, '__metadata__') else ''
         return f'{len(get_args(kind))} numbers' + (f' {limits}' if limits else '')
     names = {float: 'number', int: 'integer', str: 'word', bool: 'boolean'}
-    return _limits(field.metadata) or names.get(kind, 'path')
+    limits = '' if kind is int and _any_int32(field.metadata) else _limits(field.metadata)
+    return limits or names.get(kind, 'path')
 
 
 def _alternatives(annotation: Any) -> tuple[Any, ...]:
     united = get_origin(annotation) in (typing.Union, types.UnionType)
     return get_args(annotation) if united else (annotation,)
+
+
+def _any_int32(metadata: list[Any]) -> bool:
+    return any(getattr(limit, 'ge', None) == -(2**31) for limit in metadata)
 
 
 def _limits(metadata: list[Any]) -> str:
