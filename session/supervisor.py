@@ -288,11 +288,11 @@ class Supervisor:
             watched = (
                 node.command.has_heartbeat and node.ready and node.alive and not node.asked_to_end
             )
-            if watched and not node.hung and self._lived - node.beat > self._patience(node):
+            if watched and not node.hung and self._lived - node.beat > self._timeout_of(node):
                 node.hung = True
                 node.send_group(signal.SIGKILL)
 
-    def _patience(self, node: NodeProcess) -> float:
+    def _timeout_of(self, node: NodeProcess) -> float:
         """Return the time without a heartbeat after which a node counts as hung [s]."""
         slow = node.command.records or node.command.converses
         return SLOW_NODE_TIMEOUT_S if slow else self._heartbeat_timeout
@@ -355,7 +355,7 @@ class Supervisor:
         if node.asked_to_end or (node.done and status == 0):
             return
         elapsed = None if self._began is None else time.monotonic() - self._began
-        hung = self._patience(node) if node.hung else 0.0
+        hung = self._timeout_of(node) if node.hung else 0.0
         death = Death(node.name, status, elapsed, tuple(node.tail), hung)
         self.outcome.deaths.append(death)
         others = ', '.join(self.pids)
