@@ -69,7 +69,7 @@ class MaterialSettings(SceneModel):
         default=(),
         max_length=2,
         description='viscosity: up to two terms [g, tau], each the share of the shear modulus that '
-        'relaxes, above 0, in sum up to 0.95, and its time from 0.005 up to 1e4 s; empty: none',
+        'relaxes, above 0, in sum up to 0.95, and its time [s] from 0.005 up to 1e4; empty: none',
     )
     blade_friction: float = Field(
         default=20.0,
