@@ -173,10 +173,15 @@ def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
                 s.blade[end, k] += c.rotation[k, j] * arm[j]
                 s.arms[end, k] += c.rotation[k, j] * arm[j]
     _rotate(s.orientation, c.facing, 1.0, arm)
+    size = 0.0
     for k in range(3):
         s.facing[k] = 0.0
         for j in range(3):
             s.facing[k] += c.rotation[k, j] * arm[j]
+        size += s.facing[k] ** 2
+    if size > 0.0:  # a device may round its quaternion
+        for k in range(3):
+            s.facing[k] /= np.sqrt(size)
 
 
 @inner

@@ -12,7 +12,7 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.mesh.checks import EDGES, check_mesh, components
 from cutting_trainer.tissue_sim.mesh.files import load_labelled_mesh
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.scene_schema import UNIT_SCALE
+from cutting_trainer.tissue_sim.scene_schema import MAX_REGIONS, UNIT_SCALE
 
 _SUFFIXES = ('.msh', '.vtu', '.vtk', '.mesh', '.inp')
 """Of files that hold solids; a surface comes as STL, PLY or OBJ."""
@@ -67,6 +67,10 @@ def read_volume(path: Path, unit: str, edge: float | None) -> Volume:
         raise SessionError(f'{path} holds tetrahedra, which stay as they are: leave --edge out')
     try:
         nodes, tetrahedra, labels = load_labelled_mesh(path, UNIT_SCALE[unit])
+        if (count := len(np.unique(labels))) > MAX_REGIONS + 1:
+            raise MeshError(
+                f'{count} labels: a scene takes {MAX_REGIONS} regions and the rest; join some'
+            )
         return Volume(nodes, check_mesh(nodes, tetrahedra), labels)
     except MeshError as error:
         text = str(error)

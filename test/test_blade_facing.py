@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from bench.haptics import leading_side
 from bench.haptics.leading_side import DEPTH, TOUGHNESS, moved
+from cutting_trainer.haptic_bridge.force_kernels import SETUP, STATE, to_tissue
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.tissue_sim.contact.facing import Held, Law, settled, to_edge
 
@@ -15,6 +17,24 @@ def test_the_edge_cuts_at_its_toughness_and_spine_and_flat_resist_more_and_open_
     assert edge.force < spine.force < flat.force
     assert edge.paid > 0.0
     assert spine.paid == flat.paid == spine.opened == flat.opened == 0.0
+
+
+def test_a_region_that_the_blade_is_not_in_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The blade is held and cuts at once, so it must know whether anything was swept."""
+    monkeypatch.setattr(leading_side, 'WAY', 0.02)
+    alone = moved(1.0)
+    assert alone.opened > 0.0
+    for other in ((1e5, 0.0), (0.0, 0.0)):
+        assert moved(1.0, (other,)) == alone
+
+
+def test_a_device_that_rounds_its_quaternion_has_a_unit_facing() -> None:
+    setup, state = np.zeros(1, SETUP), np.zeros(1, STATE)
+    setup['rotation'], setup['scale'], setup['facing'] = np.eye(3), 1.0, (1.0, 0.0, 0.0)
+    turn = np.array([0.1, 0.2, 0.3, 0.9]) / np.linalg.norm([0.1, 0.2, 0.3, 0.9])
+    for given in (np.round(turn, 4), 1.005 * turn):
+        to_tissue(setup, state, np.append(np.zeros(3), given))
+        assert np.linalg.norm(state['facing'][0]) == pytest.approx(1.0, abs=1e-12)
 
 
 HELD = Held(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), 5e-4, np.zeros(1))

@@ -1,5 +1,6 @@
 """A blade goes in where the dent has done the work of its slit, and its tip pays for the slit."""
 
+import numpy as np
 import pytest
 
 from bench.haptics.puncture import TOUGHNESS, WIDTH, pushed_in
@@ -23,9 +24,22 @@ def test_a_blade_that_goes_deeper_pays_toughness_times_the_width_of_its_slit() -
 
 
 def test_a_dent_has_the_work_of_its_force_and_none_that_ended() -> None:
-    dent = Dent()
+    """The force of 100 N/m from 0.9 mm on; the coupling is a thousand times as stiff."""
+    up, dent = np.array([0.0, 0.0, 1.0]), Dent()
     for depth in (0.001, 0.002, 0.003, 0.004):
-        dent = dent.deepened(100.0 * (depth - 0.0009), depth)
-    assert dent.depth == pytest.approx(0.003)
-    assert dent.work == pytest.approx((0.01 + 0.31) / 2 * 0.003)
-    assert dent.deepened(0.0, 0.005).deepened(1.0, 0.006).work == 0.0
+        dent = dent.deepened(100.0 * (depth - 0.0009), -depth * up, up, 1e5)
+    assert dent.depth == pytest.approx(0.003 * (1 - 1e-3))
+    assert dent.work == pytest.approx((0.01 + 0.31) / 2 * dent.depth)
+    assert dent.deepened(0.0, -0.005 * up, up, 1e5).deepened(1.0, 0 * up, up, 1e5).work == 0.0
+
+
+@pytest.mark.parametrize('turn', [-0.01, 0.01])
+def test_a_dent_under_a_normal_that_turns_is_the_same_wherever_the_tissue_is(turn: float) -> None:
+    found = []
+    for place in (np.zeros(3), np.array([0.5, -0.3, 0.1])):
+        dent = Dent()
+        for k in range(10):
+            normal = np.array([np.sin(turn * k), 0.0, np.cos(turn * k)])
+            dent = dent.deepened(0.1 + 0.1 * k, place - [0, 0, 1e-4 * k], normal, 400.0)
+        found.append((dent.depth, dent.work))
+    assert found[1] == pytest.approx(found[0], rel=1e-9)

@@ -20,7 +20,7 @@ from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.recordings import recorded_scene
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import load_scene
-from cutting_trainer.tissue_sim.assembly import load_tissue, make_task
+from cutting_trainer.tissue_sim.assembly import load_tissue, make_simulation, make_task
 from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
@@ -413,3 +413,37 @@ def test_the_scene_of_a_bag_has_its_regions_again(
     bag.custom_data['scene'] = text.replace('label: 2', 'label: x')
     with pytest.raises(BagError, match='is no list of labels'):
         recorded_scene.restore_scene(bag, tmp_path)
+
+
+def test_data_that_are_no_labels_matter_only_to_a_scene_with_regions(tmp_path: Path) -> None:
+    nodes, tetrahedra = box((1, 1, 1), 0.01)
+    shares = [np.linspace(0.0, 1.0, len(tetrahedra))]
+    path = tmp_path / 'mesh.vtu'
+    meshio.Mesh(nodes, [('tetra', tetrahedra)], cell_data={'label': shares}).write(path)
+    assert len(load_tissue(settings_of(path))[1]) == len(tetrahedra)
+    with pytest.raises(MeshError, match='the data label of the cells are no labels'):
+        load_tissue(settings_of(path, {'label': 2, 'toughness': 10.0}))
+
+
+def test_a_tissue_without_regions_does_not_continue_a_scene_with_them() -> None:
+    scene = load_scene('pad')
+    before, mesh = MeshReplica(), make_task(scene.tissue).mesh
+    before.load(
+        mesh_message(TetMesh(mesh.rest, mesh.tetrahedra, mesh.fixed), 0 * mesh.rest, '', 0, 0, 0)
+    )
+    with pytest.raises(MeshError, match='the tissue to continue from has no regions'):
+        make_simulation(scene.tissue, before)
+
+
+def test_more_labels_than_a_scene_takes_are_refused_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    nodes, tetrahedra = box((3, 3, 3), 0.01)
+    labels = [np.arange(len(tetrahedra)) % 40]
+    meshio.Mesh(nodes, [('tetra', tetrahedra)], cell_data={'label': labels}).write(
+        tmp_path / 'a.vtu'
+    )
+    options = ImportOptions(tmp_path / 'a.vtu', tmp_path / 'b', 'm', None, '-z', as_json=True)
+    with pytest.raises(SessionError, match='40 labels: a scene takes 32 regions and the rest'):
+        import_mesh(options)
+    assert not (tmp_path / 'b.msh').exists()

@@ -10,7 +10,7 @@ from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.elasticity.material import Material, RegionMaterial
 from cutting_trainer.tissue_sim.mesh.checks import check_mesh, select_fixed
-from cutting_trainer.tissue_sim.mesh.files import load_labelled_mesh
+from cutting_trainer.tissue_sim.mesh.files import load_labelled_mesh, load_mesh
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
@@ -35,7 +35,11 @@ def load_tissue(
     Raises:
         MeshError: one sentence with the file, the element or node, and the remedy.
     """
-    nodes, tetrahedra, labels = load_labelled_mesh(settings.mesh, settings.unit_scale)
+    labels = np.zeros(0, np.int64)
+    if settings.regions:
+        nodes, tetrahedra, labels = load_labelled_mesh(settings.mesh, settings.unit_scale)
+    else:
+        nodes, tetrahedra = load_mesh(settings.mesh, settings.unit_scale)
     try:
         tetrahedra = check_mesh(nodes, tetrahedra)
         fixed = select_fixed(nodes, tetrahedra, settings.fixed)
@@ -140,12 +144,18 @@ def make_simulation(
         note: gets one sentence if a plan is made anew, and the name of each measurement.
 
     Raises:
-        MeshError: the mesh is not valid, or has no shape at rest under its weight.
+        MeshError: the mesh is not valid, has no shape at rest under its weight, or continues a
+            tissue without the regions of the scene.
     """
     # This comes first, see there.
     warm_up_models() if settings.method == 'auto' else warm_up_method(settings.integrator)
     # A cut mesh has coincident nodes, which the checks of a scene's mesh refuse.
     mesh = None if before is None else before.mesh()
+    if mesh is not None and settings.regions and not len(mesh.regions):
+        raise MeshError(
+            'the tissue to continue from has no regions, and the scene has tissue.regions: begin '
+            'anew, or take them out of the scene'
+        )
     task = make_task(settings, None if settings.method == 'auto' else mesh)
     found = make_plan(task, note, note) if settings.method == 'auto' else None
     taken = as_planned(settings, found)

@@ -30,6 +30,8 @@ Coordinate = Annotated[float, Field(ge=-2, le=2)]
 Stretch = Annotated[float, Field(ge=-0.3, le=0.3)]
 Acceleration = Annotated[float, Field(ge=-30, le=30)]
 Relaxing = Annotated[float, Field(gt=0, le=0.95)]
+MAX_REGIONS = 32
+"""Of a mesh, with a material of their own."""
 RelaxationTime = Annotated[float, Field(ge=0.005, le=1e4)]
 PronyTerm = Annotated[tuple[Relaxing, RelaxationTime], BeforeValidator(_as_tuple)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -289,7 +291,7 @@ class TissueSettings(SceneModel):
     )
     regions: tuple[RegionSettings, ...] = Field(
         default=(),
-        max_length=32,
+        max_length=MAX_REGIONS,
         description='regions of the mesh with a material of their own, up to 32; other '
         'tetrahedra, and values absent here, have those of `material`, which should be that of the '
         "surface under the tool. Poisson's ratio, stiffening, prony and dry friction of a region's "

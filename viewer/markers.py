@@ -188,8 +188,10 @@ def von_mises(
     turned = np.moveaxis(moved[tetrahedra[:, 1:]] - moved[tetrahedra[:, :1]], 1, 2)
     gradient = turned @ np.linalg.inv(edges)
     strain = (np.swapaxes(gradient, 1, 2) @ gradient - np.eye(3)) / 2
-    regions = replica.regions if len(replica.regions) else 0
-    mu = np.atleast_1d(youngs_modulus)[regions] / (2 * (1 + poissons_ratio))
+    moduli = np.atleast_1d(youngs_modulus)
+    # A region that the scene does not know: a stranger's mesh must not end the viewer.
+    regions = np.minimum(replica.regions, len(moduli) - 1) if len(replica.regions) else 0
+    mu = moduli[regions] / (2 * (1 + poissons_ratio))
     deviator = strain - np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3
     stress = 2 * mu * np.sqrt(1.5 * (deviator**2).sum(axis=(1, 2)))
     volumes = np.abs(np.linalg.det(edges)) / 6

@@ -40,19 +40,20 @@ class Moved:
     work: float
 
 
-def moved(angle: float) -> Moved:
+def moved(angle: float, regions: tuple[tuple[float, float], ...] = ()) -> Moved:
     """Push a blade straight into a block, and move it across itself.
 
     Args:
         angle: from the direction that the edge faces to the way [rad]: 0 edge, pi / 2 flat, pi
             spine.
+        regions: see `Resistance`; the block has none of them.
     """
     nodes, tetrahedra = good_block(_CELLS, _CELL, seed=3)
     mesh = TetMesh(nodes, tetrahedra, nodes[:, 2] < 1e-9)
     simulation = TissueSimulation(
         mesh,
         Material(30000.0, 0.4, 1000.0, 15.0, 2e-4),
-        Resistance(0.02, TOUGHNESS, 0.0),
+        Resistance(0.02, TOUGHNESS, 0.0, regions=regions),
         stepping=TimeStepping('symplectic_euler', rate=_RATE, max_substeps=1000),
     )
     method, asks = make_method(CuttingSettings()), CutTransaction(simulation)

@@ -145,8 +145,8 @@ class Blade:
         self._element = 0.0
         self._back: np.ndarray | None = None
         self._failed = self._set_back = False
-        self.paid = self.rubbed = self._confirmed = 0.0
-        self._settle(no_pull(0.0, 0.0))
+        self.paid = self.rubbed = self._swept = 0.0
+        self._settle(no_pull())
 
     @property
     def device(self) -> np.ndarray:
@@ -228,7 +228,7 @@ class Blade:
         """Let the edge follow the device without force: nothing is known of the tool."""
         self._state.spans[:] = 0.0
         self._strips.counts[:] = 0
-        self._settle(no_pull(0.0, 0.0))
+        self._settle(no_pull())
 
     def spring(
         self, positions: np.ndarray, ahead: np.ndarray, share: float, stiffness: float
@@ -282,8 +282,8 @@ class Blade:
         self.limit, self.lag = float(pull.limit), float(pull.lag)
         self.paid += float(pull.paid)
         self.rubbed += float(pull.rubbed)
-        free = self.paid - self._confirmed <= self._law.toughness.max() * _MIN_AREA
-        if pull.held and free and not self._failed and self._law.toughness.min() > 0.0:
+        self._swept += float(pull.swept)
+        if pull.held and self._swept <= _MIN_AREA and not self._failed:
             # Spine or flat have carried the tissue along: nothing is to be opened.
             self._cut_tip, self._cut_edge = self._tip.copy(), self._edge.copy()
         length = float(np.linalg.norm(root - tip)) / POINTS
@@ -298,7 +298,7 @@ class Blade:
 
     def confirm_sweep(self) -> None:
         """Start the next sweep from the present edge."""
-        self._confirmed = self.paid
+        self._swept = 0.0
         self._before = (self._cut_tip - self._tip, self._cut_edge, self._back)
         self._cut_tip = self._tip.copy()
         self._cut_edge = self._edge.copy()

@@ -96,6 +96,7 @@ class Pull(NamedTuple):
         line: lag of the tip, and how much more the root lags [m], shape (2, 3).
         lag: mean distance in the tissue [m].
         paid, rubbed: work of cutting and of friction [J].
+        swept: area of uncut tissue that the edge has gone through [m^2].
         held: whether spine or flat carry tissue along anywhere.
     """
 
@@ -107,13 +108,14 @@ class Pull(NamedTuple):
     lag: float
     paid: float
     rubbed: float
+    swept: float
     held: bool
 
 
 @inner
-def no_pull(paid, rubbed):
-    """Return the `Pull` of an edge in the air, with the works so far [J]."""
-    return Pull(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros((2, 3)), 0.0, paid, rubbed, False)
+def no_pull():
+    """Return the `Pull` of an edge in the air."""
+    return Pull(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros((2, 3)), 0.0, 0.0, 0.0, 0.0, False)
 
 
 @kernel
@@ -131,18 +133,18 @@ def follow_device(edge, strips, device, moved, tissue, law):
     direction, piece = _direction(device)
     _lag_behind(edge, device)
     _immerse(edge, device, tissue)
-    paid, rubbed, limit = 0.0, 0.0, -1.0
+    paid, rubbed, swept, limit = 0.0, 0.0, 0.0, -1.0
     facing = across(law.facing, direction)
     if not edge.spans.any():
         strips.counts[:] = 0
-        return no_pull(paid, rubbed)
+        return no_pull()
     low, high = _box(edge, device)
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
     fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
     blade = Held(direction, facing, piece, np.zeros(POINTS))
     for _ in range(_MAX_SLIPS):
-        limit, cut, rub = _slip(edge, strips, device, faces, blade, law, fresh, limits)
-        paid, rubbed = paid + cut, rubbed + rub
+        limit, cut, rub, area = _slip(edge, strips, device, faces, blade, law, fresh, limits)
+        paid, rubbed, swept = paid + cut, rubbed + rub, swept + area
         if limit >= 0.0:
             break
         _immerse(edge, device, tissue)
@@ -167,7 +169,7 @@ def follow_device(edge, strips, device, moved, tissue, law):
         torque += np.cross(arms[i] * direction, pull)
     line, mean = _line(edge.spans, ways)
     lag = np.sqrt((mean**2).sum())
-    return Pull(force, torque, limit, torque_limit, line, lag, paid, rubbed, held)
+    return Pull(force, torque, limit, torque_limit, line, lag, paid, rubbed, swept, held)
 
 
 @kernel
@@ -447,7 +449,7 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits):
 
     Returns:
         The largest force that the edge transmits as it is pulled [N], -1 where a point slipped;
-        the work of cutting and that of friction [J].
+        the work of cutting and that of friction [J]; the uncut area that was swept [m^2].
     """
     slid, ways = np.zeros(POINTS), device - edge.points
     _resist(edge, ways, faces, blade, law, fresh, limits)
@@ -462,20 +464,22 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits):
         ways[i] *= slid[i] / size
         cutting = cutting or (fresh[i] and slid[i] > _SETTLED)
     if slid.max() < _SETTLED:
-        return limits.sum(), 0.0, 0.0
+        return limits.sum(), 0.0, 0.0, 0.0
     knots = _knots(edge, device)
-    work, rub = 0.0, 0.0
+    work, rub, area = 0.0, 0.0, 0.0
     for i in range(POINTS):
         if edge.spans[i] > 0.0:
             work += limits[i] * slid[i]
             rub += law.friction[edge.region[i]] * blade.piece * edge.spans[i] * slid[i]
             edge.points[i] += ways[i]
+            if fresh[i]:
+                area += blade.piece * edge.spans[i] * _split(ways[i], blade.direction)[1]
     _lag_behind(edge, device)
     if cutting:
         add_strip(strips, knots, _knots(edge, device))
     else:
         strips.counts[1] = 0
-    return -1.0, work - rub, rub
+    return -1.0, work - rub, rub, area
 
 
 @inner

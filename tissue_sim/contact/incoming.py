@@ -49,7 +49,7 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
         if not (np.abs(values) <= _MAX_COORDINATE).all():  # a NaN is not
             text = f'{name} {values.tolist()} is not finite or beyond {_MAX_COORDINATE:g}'
             raise MessageError('not finite or too far', text)
-    if message.blade_facing.any() and abs(np.linalg.norm(message.blade_facing) - 1) > 1e-6:
+    if message.blade_facing.any() and abs(np.linalg.norm(message.blade_facing) - 1) > 1e-3:
         text = f'blade_facing {message.blade_facing.tolist()} is neither a unit vector nor zero'
         raise MessageError('no unit vector', text)
     if not _MIN_STIFFNESS <= message.coupling_stiffness <= _MAX_STIFFNESS:

@@ -26,8 +26,7 @@ def load_mesh(path: Path, unit_scale: float) -> tuple[NDArray[np.float64], NDArr
 
     Arguments, result and errors: see `load_labelled_mesh`.
     """
-    nodes, tetrahedra, _ = load_labelled_mesh(path, unit_scale)
-    return nodes, tetrahedra
+    return _solid(path, _read(path), unit_scale)
 
 
 def load_labelled_mesh(
@@ -51,6 +50,13 @@ def load_labelled_mesh(
         MeshError: the file is unreadable or has elements other than such tetrahedra.
     """
     mesh = _read(path)
+    return *_solid(path, mesh, unit_scale), _labels(path, mesh)
+
+
+def _solid(
+    path: Path, mesh: Any, unit_scale: float
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Return the used nodes [m] and the tetrahedra of a mesh that was read."""
     tetrahedra = _tetrahedra(path, mesh)
     points = np.asarray(mesh.points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -73,7 +79,7 @@ def load_labelled_mesh(
             points[orphans[0]].tolist(),
         )
     renumbered = np.cumsum(used, dtype=np.int32) - 1
-    return points[used] * unit_scale, renumbered[tetrahedra].astype(np.int32), _labels(path, mesh)
+    return points[used] * unit_scale, renumbered[tetrahedra].astype(np.int32)
 
 
 def _read(path: Path) -> Any:
@@ -124,14 +130,15 @@ def _labels(path: Path, mesh: Any) -> NDArray[np.int64]:
     for name in _LABELS:
         if name in mesh.cell_data:
             values = np.concatenate([np.asarray(mesh.cell_data[name][i]).ravel() for i in wanted])
-            labels = values.astype(np.int64)
+            whole = np.isfinite(values).all() and (np.abs(values) < 2**31).all()
+            labels = values.astype(np.int64) if whole else np.zeros(0, np.int64)
             if (
                 len(labels) != sum(len(mesh.cells[i].data) for i in wanted)
                 or (labels != values).any()
             ):
                 raise MeshError(
                     f'{path}: the data {name} of the cells are no labels: each tetrahedron needs '
-                    'one whole number'
+                    'one whole number below 2^31'
                 )
             return np.asarray(labels)
     return np.zeros(sum(len(mesh.cells[i].data) for i in wanted), np.int64)

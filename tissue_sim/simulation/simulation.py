@@ -142,7 +142,10 @@ class TissueSimulation:
         motion = self.dynamics.advance(coupling, tool)
         if tool is not None:
             self._blade, coupling = tool.blade, tool.coupling
-        self._dent = Dent() if tool is None else tool.dent
+        if tool is not None:
+            self._dent = tool.dent
+        elif contact is None or jump or contact.state != ContactState.TOUCHING:
+            self._dent = Dent()
         pressed = self._push_of(coupling)
         self._pressed = footprint_force(self._pressed, pressed)
         self._springs.end_frame(coupling, self.displacement, pressed)

@@ -155,6 +155,7 @@ def check_simulation(simulation: TissueSimulation) -> None:
         _check_region(dynamics._active, n)
     else:
         _check_far_field(dynamics, n)
+    has_room('tip of the dent', simulation._dent.tip, 3)
     _check_blade(simulation, n)
 
 

@@ -24,22 +24,35 @@ class Dent(NamedTuple):
 
     Attributes:
         force: of the tool [N].
-        place: of its tip into the tissue, without the stretch of the coupling [m].
+        tip: place of the tool's tip [m], shape (3,).
+        stretch: of the coupling [m].
         depth: from where it touched [m].
         work: on the tissue [J].
     """
 
     force: float = 0.0
-    place: float = 0.0
+    tip: np.ndarray = np.zeros(3)
+    stretch: float = 0.0
     depth: float = 0.0
     work: float = 0.0
 
-    def deepened(self, force: float, place: float) -> 'Dent':
-        """Return the dent at another force [N] and place [m]."""
+    def deepened(
+        self, force: float, tip: np.ndarray, normal: np.ndarray, stiffness: float
+    ) -> 'Dent':
+        """Return the dent at another force [N] and place of the tip [m].
+
+        Args:
+            force: of the tool [N].
+            tip: place of its tip [m], shape (3,).
+            normal: of the surface, outward, shape (3,).
+            stiffness: of the coupling [N/m].
+        """
+        stretch = force / stiffness
         if force <= 0.0 or self.force <= 0.0:
-            return Dent(force, place)
-        way = place - self.place
-        return Dent(force, place, self.depth + way, self.work + (force + self.force) / 2 * way)
+            return Dent(force, tip, stretch)
+        way = float((self.tip - tip) @ normal) - (stretch - self.stretch)
+        work = self.work + (force + self.force) / 2 * way
+        return Dent(force, tip, stretch, self.depth + way, work)
 
 
 class ToolInFrame:
@@ -118,14 +131,17 @@ class ToolInFrame:
     def _punctures(self, share: float, positions: np.ndarray) -> bool:
         """Return whether the tool presses harder on the surface than it bears."""
         spring = self._pushing
-        if spring.mode != PUSH or self._contact.mode == ToolMode.PALPATOR:
+        if spring.mode != PUSH:
             return False
         pressed = float(np.linalg.norm(spring.force(positions, share)))
+        if self._resistance.tip_width > 0.0:
+            tip, stiffness = self._device(share)[1], self._contact.stiffness
+            self.dent = self.dent.deepened(pressed, tip, spring.normal, stiffness)
+        if self._contact.mode == ToolMode.PALPATOR:
+            return False
         at_tip = self._toughness() * self._resistance.tip_width
         if at_tip == 0.0:
             return pressed >= self._resistance.threshold
-        tip = -float(self._device(share)[1] @ spring.normal)
-        self.dent = self.dent.deepened(pressed, tip - pressed / self._contact.stiffness)
         return self.dent.work >= at_tip * self.dent.depth > 0.0
 
     def _toughness(self) -> float:
