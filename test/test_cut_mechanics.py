@@ -1,17 +1,16 @@
 """What has been cut behaves like a slit, and what is tied together again like tissue never cut."""
 
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from meshes import box, irregular_box
 
 from bench.cuts.random_strokes import random_stroke, shuffled_box
+from bench.cuts.strokes import results_along
 from cutting_trainer.cutting.method_interface import CASES
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
-from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
@@ -31,11 +30,7 @@ def cut_model(mesh: TetMesh, path: np.ndarray) -> tuple[ElasticModel, np.ndarray
     model = ElasticModel(mesh, MATERIAL)
     method = make_method(CuttingSettings())
     cases = np.zeros(len(CASES), np.int64)
-    for sweep in [*(Sweep(*a, *b) for a, b in pairwise(path)), None]:
-        if sweep is None:
-            result = method.finish(mesh, mesh.rest)
-        else:
-            result = method.advance(mesh, mesh.rest, sweep)
+    for result in results_along(method, mesh, path):
         if not result.delta.empty:
             model.update(mesh.apply(result.delta))
         cases += result.report.cases

@@ -1,7 +1,5 @@
 """What every elastic model must do, and where the plain ones are known to fail."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,10 +8,10 @@ from meshes import box, irregular_box
 from scipy.spatial.transform import Rotation
 
 from bench.cuts.random_strokes import random_stroke, shuffled_box
+from bench.cuts.strokes import results_along
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.node_common.errors import MeshError
-from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import (
@@ -251,14 +249,8 @@ def test_after_a_cut_every_model_equals_a_rebuild(name: ModelName) -> None:
         mesh = TetMesh(nodes, tets)
         model, method = ElasticModel(mesh, LIVER, name), make_method(CuttingSettings())
         path = random_stroke(('plane', 'arc', 'twist')[seed % 3], nodes, 0.005, rng)
-        sweeps = [Sweep(*a, *b) for a, b in pairwise(path)]
         model.force(1e-4 * rng.normal(size=nodes.shape))
-        for sweep in [*sweeps, None]:
-            result = (
-                method.finish(mesh, mesh.rest)
-                if sweep is None
-                else method.advance(mesh, mesh.rest, sweep)
-            )
+        for result in results_along(method, mesh, path):
             if not result.delta.empty:
                 model.update(mesh.apply(result.delta))
         fresh = ElasticModel(mesh, LIVER, name)

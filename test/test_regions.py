@@ -1,7 +1,6 @@
 """Several materials in one mesh: against exact layers, quadratic elements, and under cuts."""
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 from meshes import box, irregular_box
 
 from bench.cuts.random_strokes import random_stroke, shuffled_box
+from bench.cuts.strokes import results_along
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
@@ -21,7 +21,7 @@ from cutting_trainer.recordings import recorded_scene
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import load_tissue, make_simulation, make_task
-from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance, Sweep
+from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
@@ -189,11 +189,7 @@ def test_regions_keep_their_volumes_and_their_materials_under_any_cut(name: Mode
         before = np.bincount(mesh.regions, mesh.volumes())
         model, method = ElasticModel(mesh, material, name), make_method(CuttingSettings())
         path = random_stroke(('plane', 'arc', 'twist')[seed], nodes, 0.005, rng)
-        for sweep in [*(Sweep(*a, *b) for a, b in pairwise(path)), None]:
-            if sweep is None:
-                result = method.finish(mesh, mesh.rest)
-            else:
-                result = method.advance(mesh, mesh.rest, sweep)
+        for result in results_along(method, mesh, path):
             if not result.delta.empty:
                 moved += len(result.delta.moved_nodes)
                 model.update(mesh.apply(result.delta))

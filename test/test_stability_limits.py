@@ -6,16 +6,15 @@ trainer uses: on a block as it was loaded, nearly incompressible, and cut at the
 
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from meshes import irregular_box
 from pairs import EXPLICIT, thinned
 
+from bench.cuts.strokes import results_along
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
-from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
@@ -56,11 +55,7 @@ def changes() -> tuple[TopologyDelta, ...]:
     cutter = make_method(CuttingSettings.model_validate({'method': 'subdivide'}))
     way = np.linspace(-0.002, 0.012, 6)
     path = np.array([[[0.0083, y, 0.02], [0.0083, y, 0.0042]] for y in way])
-    for sweep in [*(Sweep(*a, *b) for a, b in pairwise(path)), None]:
-        if sweep is None:
-            result = cutter.finish(mesh, mesh.rest)
-        else:
-            result = cutter.advance(mesh, mesh.rest, sweep)
+    for result in results_along(cutter, mesh, path):
         if not result.delta.empty:
             mesh.apply(result.delta)
             deltas.append(result.delta)

@@ -1,15 +1,13 @@
 """Viscosity against the exact answers of its Prony series, and what it must not do."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from meshes import irregular_box
 
 from bench.accuracy.prony import shear_relaxation, uniaxial_creep, uniaxial_relaxation
 from bench.cuts.random_strokes import random_stroke
+from bench.cuts.strokes import results_along
 from bench.figures.tissue_relaxation import cycle
-from cutting_trainer.cutting.method_interface import Sweep
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.coupling import FREE, HOLD, Coupling
@@ -227,11 +225,8 @@ def cut_through(dynamics: Dynamics, seed: int) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
     mesh, method = dynamics.mesh, make_method(CuttingSettings())
     path = random_stroke('plane', mesh.rest, SIDE / 3, rng)
-    sweeps = [Sweep(*a, *b) for a, b in pairwise(path)]
     loads = []
-    for sweep in [*sweeps, None]:
-        at = mesh.rest + dynamics.displacement
-        result = method.finish(mesh, at) if sweep is None else method.advance(mesh, at, sweep)
+    for result in results_along(method, mesh, path, lambda: dynamics.positions):
         if not result.delta.empty:
             dynamics.apply_cut(result.delta)
             assert dynamics.loads is not None

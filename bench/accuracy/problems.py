@@ -5,7 +5,6 @@ Each is small enough to be solved on a desk and has a reference of its own (`cha
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +28,9 @@ from bench.accuracy.reference import (
     graded,
 )
 from bench.common.meshes import PLANE_TOLERANCE_M, beam, end_load, kuhn_block, on_plane, pressed
+from bench.cuts.strokes import results_along
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
-from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
 from cutting_trainer.tissue_sim.elasticity.material import Material
@@ -313,11 +312,7 @@ class AfterCut:
         way = np.linspace(-0.3 * width, 1.3 * width, 9)
         x = self._plane
         path = np.array([[[x, y, 1.2 * height], [x, y, height / 2]] for y in way])
-        for sweep in [*(Sweep(*a, *b) for a, b in pairwise(path)), None]:
-            if sweep is None:
-                result = method.finish(mesh, mesh.rest)
-            else:
-                result = method.advance(mesh, mesh.rest, sweep)
+        for result in results_along(method, mesh, path):
             if not result.delta.empty:
                 mesh.apply(result.delta)
                 deltas.append(result.delta)

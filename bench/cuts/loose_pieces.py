@@ -9,7 +9,6 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import trimesh
@@ -25,11 +24,12 @@ from bench.cuts.curves import (
     scattered,
     slab,
 )
+from bench.cuts.strokes import results_along
 from cutting_trainer.cutting.method_interface import CutMethod
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.scene_loader import load_scene
-from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
+from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.pieces import Piece, PieceRegister, free_parts
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -182,12 +182,7 @@ def simulation_of(organ: Organ, scene: str, cut: Cut, name: str) -> TissueSimula
 
 def draw(simulation: TissueSimulation, path: Floats, cutter: CutMethod) -> None:
     """Move a blade along a path through the tissue as it stands."""
-    for a, b in [*pairwise(path), (None, None)]:
-        mesh, positions = simulation.mesh, simulation.positions
-        if a is None or b is None:
-            result = cutter.finish(mesh, positions)
-        else:
-            result = cutter.advance(mesh, positions, Sweep(a[0], a[1], b[0], b[1]))
+    for result in results_along(cutter, simulation.mesh, path, lambda: simulation.positions):
         if not result.delta.empty:
             simulation.apply_cut(result.delta)
 

@@ -8,7 +8,6 @@ import argparse
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +29,12 @@ from bench.cuts.curves import (
     scattered,
     slab,
 )
+from bench.cuts.strokes import results_along
 from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.cutting.cut_invariants import ViolationError, check_mesh, cut_faces
 from cutting_trainer.cutting.method_interface import FAILURES
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
-from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 Floats = NDArray[np.float64]
@@ -93,12 +92,7 @@ def cut_mesh(
     try:
         for path in cut.paths:
             old = cut_faces(mesh)
-            sweeps = [Sweep(a[0], a[1], b[0], b[1]) for a, b in pairwise(path)]
-            for sweep in [*sweeps, None]:
-                if sweep is None:
-                    result = cutter.finish(mesh, mesh.rest)
-                else:
-                    result = cutter.advance(mesh, mesh.rest, sweep)
+            for result in results_along(cutter, mesh, path):
                 warnings += result.report.warnings
                 volume -= result.report.removed_volume
                 if not result.delta.empty:

@@ -1,12 +1,17 @@
 """Meshes and strokes of a blade through them, for the comparison of methods of cutting."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cutting_trainer.cutting.method_interface import CutMethod, CutResult
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import load_tissue
+from cutting_trainer.tissue_sim.contact.blade import Sweep
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 Floats = NDArray[np.float64]
 
@@ -31,6 +36,29 @@ class Stroke:
     tetrahedra: NDArray[np.int64]
     fixed: NDArray[np.uint8]
     paths: tuple[Floats, ...]
+
+
+def results_along(
+    method: CutMethod,
+    mesh: TetMesh,
+    path: Floats,
+    positions: Callable[[], Floats] | None = None,
+) -> Iterator[CutResult]:
+    """Draw a blade along a path, and end the stroke.
+
+    Args:
+        method: of cutting.
+        mesh: the tissue; whoever asks for the next result has applied the last one.
+        path: root and tip of the blade [m], shape (k, 2, 3).
+        positions: gives those of the nodes [m], shape (n, 3); None: at rest.
+
+    Yields:
+        The result of each sweep, then that of the end.
+    """
+    for a, b in pairwise(path):
+        now = mesh.rest if positions is None else positions()
+        yield method.advance(mesh, now, Sweep(*a, *b))
+    yield method.finish(mesh, mesh.rest if positions is None else positions())
 
 
 def strokes() -> tuple[Stroke, ...]:

@@ -1,15 +1,12 @@
 """Figures of the faces of a cut: they meet, carry compression, and carry no tension."""
 
-from itertools import pairwise
-
 import numpy as np
 import trimesh
 
-from bench.cuts.strokes import good_block
+from bench.cuts.strokes import good_block, results_along
 from bench.figures.figure import Figure
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
-from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.checks import EDGES, components
@@ -76,11 +73,7 @@ def slab(shape: str, friction: float, *, seed: int = 3, cut: bool = True) -> Dyn
             for a, w in zip(at, way, strict=True)
         ]
         method = make_method(CuttingSettings())
-        for sweep in [*(Sweep(*a, *b) for a, b in pairwise(np.array(path))), None]:
-            if sweep is None:
-                result = method.finish(mesh, mesh.rest)
-            else:
-                result = method.advance(mesh, mesh.rest, sweep)
+        for result in results_along(method, mesh, np.array(path)):
             if not result.delta.empty:
                 dynamics.apply_cut(result.delta)
     return dynamics

@@ -14,12 +14,8 @@ import numpy as np
 
 from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
 from cutting_trainer.tissue_sim.contact.edge import (
-    POINTS,
-    SHARES,
     WHOLE,
-    Edge,
     Pull,
-    Tissue,
     carry_edge,
     follow_device,
     gather_loads,
@@ -27,6 +23,7 @@ from cutting_trainer.tissue_sim.contact.edge import (
 )
 from cutting_trainer.tissue_sim.contact.facing import BLADE_HEIGHT, Law
 from cutting_trainer.tissue_sim.contact.fracture import BLADE_THICKNESS, Strips
+from cutting_trainer.tissue_sim.contact.immersion import POINTS, SHARES, Edge, Tissue
 from cutting_trainer.tissue_sim.mesh.locate import NearElements
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, tetrahedron_volumes
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
 
-_TINY = 1e-300
+TINY = 1e-300
+"""Divisor that is no length, where these are 0."""
 BLADE_HEIGHT = 5e-3
 """[m] of a scalpel's blade from its edge to its spine."""
 _HELD_REACH = 5e-3
@@ -123,24 +124,22 @@ def to_edge(way, blade):
         Share of the way that is left.
     """
     whole = dot(way, way)
-    along, ahead = dot(way, blade.direction), dot(way, blade.facing)
-    aside = max(whole - along * along - ahead * ahead, 0.0)
-    kept, part = along * along, 0.0
+    along, towards = dot(way, blade.direction), dot(way, blade.facing)
+    aside = max(whole - along * along - towards * towards, 0.0)
+    ahead, kept, part = max(towards, 0.0), along * along, 0.0
     if ahead > 0.0:
         part = max(1.0 - aside / (ahead * ahead), 0.0)
         kept += ahead * ahead + part * aside
-    else:
-        ahead = 0.0
     square = along * along + ahead * ahead + part * part * aside
-    scale = kept / max(square, _TINY)
-    whole_ahead, left = dot(way, blade.facing), 0.0
+    scale = kept / max(square, TINY)
+    left = 0.0
     for c in range(3):
         onward = along * blade.direction[c] + ahead * blade.facing[c]
-        beside = way[c] - along * blade.direction[c] - whole_ahead * blade.facing[c]
+        beside = way[c] - along * blade.direction[c] - towards * blade.facing[c]
         after = scale * (onward + part * beside)
         left += (way[c] - after) ** 2
         way[c] = after
-    return np.sqrt(left / max(whole, _TINY))
+    return np.sqrt(left / max(whole, TINY))
 
 
 @inner

@@ -141,9 +141,7 @@ class TissueSimulation:
         coupling = Coupling() if tool is None else tool.coupling
         motion = self.dynamics.advance(coupling, tool)
         if tool is not None:
-            self._blade, coupling = tool.blade, tool.coupling
-        if tool is not None:
-            self._dent = tool.dent
+            self._blade, coupling, self._dent = tool.blade, tool.coupling, tool.dent
         elif contact is None or jump or contact.state != ContactState.TOUCHING:
             self._dent = Dent()
         pressed = self._push_of(coupling)

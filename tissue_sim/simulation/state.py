@@ -13,6 +13,7 @@ from cutting_trainer.tissue_sim.contact import (
     footprint,
     fracture,
     friction,
+    immersion,
     tool_spring,
 )
 from cutting_trainer.tissue_sim.contact import tool as contact
@@ -71,6 +72,7 @@ _MODULES = (
     contact_stiffness,
     corotational,
     coupling,
+    cut_contact,
     domains,
     dynamics,
     edge,
@@ -82,8 +84,8 @@ _MODULES = (
     fracture,
     friction,
     guard,
+    immersion,
     integrators,
-    cut_contact,
     loads,
     local_rows,
     material,

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.tissue_sim.contact.edge import POINTS
 from cutting_trainer.tissue_sim.contact.fracture import KNOTS, MAX_STRIPS
 from cutting_trainer.tissue_sim.contact.friction import GrippingSprings
+from cutting_trainer.tissue_sim.contact.immersion import POINTS
 from cutting_trainer.tissue_sim.elasticity.adaptive_law import Law
 from cutting_trainer.tissue_sim.elasticity.corotational import KEPT, Elements
 from cutting_trainer.tissue_sim.elasticity.local_rows import Locality
