@@ -35,7 +35,6 @@ PLACES = {
     r'bags/sessions/(NAME|first)\b': 'BAG',
     r'(picture BAG -o) first': r'\1 liver',
     r'(report BAG -o) first': r'\1 report',
-    r'(export BAG) liver.vtu': r'\1 mesh.vtu',
     r'\b(SCENE|NAME)\b': 'block',
     r'-side --scene liver --peer [\d.]+': '-side --scene --peer',
     r'\bFOLDER_OF_ITS_SOURCES\b': 'crtk_msgs',
@@ -82,7 +81,6 @@ PACKAGED = Nowhere('needs ROS from packages, which cannot be installed beside th
 PEERS = Nowhere('the peers are no dependency; test_peers.py tries what needs none of them')
 HERE = (
     'picture BAG -o liver.png',
-    'export BAG mesh.vtu',
     'picture bags/samples/format_6/crossing_cuts -o crossing_cuts.png',
     'picture BAG',
     'report BAG -o report.html',
