@@ -11,9 +11,9 @@ from cutting_trainer.session.errors import SessionError
 
 Tier = Literal['quick', 'usual', 'all']
 """Which tests are run; test/conftest.py says what each leaves out."""
-TESTS, ALONE = 'tests', 'tests one at a time'
-MAX_REPETITIONS_ALONE = 3
-"""Further runs of those tests one at a time that failed. They measure the clock, and a shared
+TESTS, LIVE, ALONE = 'tests', 'tests two at a time', 'tests one at a time'
+MAX_REPETITIONS = 3
+"""Further runs, one at a time, of those live tests that failed. They have deadlines, and a shared
 machine may stand still for seconds; each says what it measured."""
 TESTS_FAILED, NO_TESTS = 1, 5
 """Exit statuses of pytest: some test failed; there was none."""
@@ -54,9 +54,10 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
     of mypy stand in pyproject.toml.
 
     Args:
-        pytest_arguments: for both parts of the tests: those that may run beside others, on every
-            processor, and those that want the machine for themselves.
-        temporary: folder for the files of both: the last tests look at what all have made.
+        pytest_arguments: for all parts of the tests: those that may run beside others, on every
+            processor; those with a graph, two at a time, as they mostly wait; and those that want
+            the machine for themselves.
+        temporary: folder for the files of all: the last tests look at what all have made.
         tier: the quick one has only tests of the first part, and leaves out the types.
     """
     python = (sys.executable, '-m')
@@ -67,13 +68,14 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
     ]
     for name, part, more, repetitions in (
         (TESTS, 'beside', ('--numprocesses=auto', '--dist=loadfile'), 0),
-        (ALONE, 'alone', (), MAX_REPETITIONS_ALONE),
+        (LIVE, 'live', ('--numprocesses=2', '--dist=loadfile'), MAX_REPETITIONS),
+        (ALONE, 'alone', (), MAX_REPETITIONS),
     ):
         which = (f'--tier={tier}', f'--part={part}', '--last-failed-no-failures=none')
         where = (f'--basetemp={temporary / part}', '-o', f'cache_dir=.pytest_cache/{part}')
         argv = (*python, 'pytest', *which, *where, *more, *pytest_arguments)
         checks.append(Check(name, argv, repetitions))
-    return [check for check in checks if tier != 'quick' or check.name not in ('mypy', ALONE)]
+    return [check for check in checks if tier != 'quick' or check.name not in ('mypy', LIVE, ALONE)]
 
 
 def run_checks(
@@ -109,16 +111,16 @@ def run_checks(
 def again(check: Check, number: int) -> list[str]:
     """Return the command of a check for the tests that failed, with a folder of its own."""
     argv = [f'{a}-{number}' if a.startswith('--basetemp=') else a for a in check.argv]
-    return [*argv, '--last-failed']
+    return [*argv, '--last-failed', '--numprocesses=0']
 
 
 def verdict(results: dict[str, int]) -> tuple[int, str]:
     """Return exit status of the first check that failed, 0 if none did, and a sentence that names
     all.
 
-    Arguments may choose tests of one part only; of none is a failure.
+    Arguments may choose tests of some parts only; of none is a failure.
     """
-    parts = [name for name in (TESTS, ALONE) if name in results]
+    parts = [name for name in (TESTS, LIVE, ALONE) if name in results]
     empty = [name for name in parts if results[name] == NO_TESTS]
     if len(empty) < len(parts):
         results = {name: status for name, status in results.items() if name not in empty}

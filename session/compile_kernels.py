@@ -72,9 +72,9 @@ def warm_up_arm() -> None:
 
 # The longest first: each processor takes the next one.
 DEMO: dict[str, Callable[[], None]] = {
+    'tissue': partial(warm_up_method, 'symplectic_euler'),
     'cutting': partial(warm_up_cutting, CuttingSettings()),
     'force loop': warm_up_haptics,
-    'tissue': partial(warm_up_method, 'symplectic_euler'),
     'emulated arm': warm_up_arm,
 }
 FURTHER: dict[str, Callable[[], None]] = {

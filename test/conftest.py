@@ -25,8 +25,10 @@ settings.register_profile('quick', deadline=None, max_examples=10)
 STAND_INS = Path(__file__).with_name('stand_ins')
 PYTHON = f'python{sys.version_info.major}.{sys.version_info.minor}'
 BUILT = pytest.StashKey[Path]()
-ALONE = {'alone', 'real_time'}
-LEFT_OUT = {'quick': {'long', 'thorough', *ALONE}, 'usual': {'thorough'}, 'all': set[str]()}
+PARTS = {'beside': set[str](), 'live': {'live'}, 'alone': {'alone', 'real_time'}}
+"""Marks of the tests of each part; those without such a mark run beside others."""
+APART = set[str]().union(*PARTS.values())
+LEFT_OUT = {'quick': {'long', 'thorough', *APART}, 'usual': {'thorough'}, 'all': set[str]()}
 """Marks of the tests that a tier leaves out."""
 MODULE_MARKS = re.compile(r'^pytestmark = (\[[^\]]*\]|.*)', re.MULTILINE)
 RUN = 'TRAINER_TEST_RUN'
@@ -34,12 +36,12 @@ RUN = 'TRAINER_TEST_RUN'
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add `--part` and `--tier`: `trainer test` runs both parts of a tier, one after the other."""
+    """Add `--part` and `--tier`: `trainer test` runs the parts of a tier, one after the other."""
     parser.addoption(
         '--part',
-        choices=('beside', 'alone'),
-        help='only tests that may run beside others, or only those that must not: '
-        'they measure the clock, or what a processor does',
+        choices=tuple(PARTS),
+        help='only tests that may run beside others; or those with a graph, two at a time; '
+        'or those that must run alone: they measure the clock, or what a processor does',
     )
     parser.addoption(
         '--tier',
@@ -58,6 +60,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     settings.load_profile(config.getoption('tier'))
     os.environ.update(discovery(os.environ))
+    if config.getoption('part') == 'beside':  # the threads of one would wait for those of others
+        os.environ['OPENBLAS_NUM_THREADS'] = '1'
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not config.getoption('numprocesses', None):  # else each worker has its own
@@ -69,11 +73,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if collection_path.suffix != '.py' or not collection_path.is_file():
         return None
     text, part = collection_path.read_text(encoding='utf-8'), config.getoption('part')
-    if part == 'alone' and not any(f'mark.{name}' in text for name in ALONE):
+    wanted = PARTS[part] if part else set()
+    if wanted and not any(f'mark.{name}' in text for name in wanted):
         return True
     found = MODULE_MARKS.search(text)
     marks = set(re.findall(r'pytest\.mark\.(\w+)', found[1])) if found else set()
-    left_out = LEFT_OUT[config.getoption('tier')] | (ALONE if part == 'beside' else set())
+    left_out = LEFT_OUT[config.getoption('tier')] | (APART - PARTS[part] if part else set())
     return True if marks & left_out else None
 
 
@@ -85,8 +90,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     chosen, others = [], []
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        in_part = part is None or bool(marks & ALONE) == (part == 'alone')
-        (chosen if in_part and not marks & left_out else others).append(item)
+        own = next((name for name, those in PARTS.items() if marks & those), 'beside')
+        (chosen if part in (None, own) and not marks & left_out else others).append(item)
     items[:] = chosen
     config.hook.pytest_deselected(items=others)
 

@@ -36,7 +36,7 @@ from cutting_trainer.node_common.qos import LATCHED, STREAM, UPDATES
 from cutting_trainer.node_common.ros import CONTACT, FRAME_INPUTS, MESH_UPDATES, TISSUE_STATE
 from cutting_trainer.session.scene_loader import find_scene
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 
 @pytest.fixture

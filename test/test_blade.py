@@ -16,6 +16,8 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
+pytestmark = pytest.mark.long
+
 TOUGHNESS, RATE = 40.0, 500.0
 
 
@@ -36,8 +38,10 @@ def contact_at(simulation: TissueSimulation, tip: np.ndarray) -> ToolContact:
     corners = mesh.rest[mesh.triangles]
     edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
     flat = np.flatnonzero((corners[:, :, 2] > 0.0199).all(axis=1))
-    shares = [np.linalg.lstsq(edges[k], at - corners[k, 0], rcond=None)[0] for k in flat]
-    weights = np.array([[1 - a - b, a, b] for a, b in shares])
+    across = edges[flat].transpose(0, 2, 1)
+    from_first = (at - corners[flat, 0])[:, :, None]
+    shares = np.linalg.solve(across @ edges[flat], across @ from_first)[:, :, 0]
+    weights = np.column_stack([1 - shares.sum(axis=1), shares])
     best = int(np.argmax(weights.min(axis=1)))
     return ToolContact(
         state=ContactState.TOUCHING if tip[2] < 0.02 else ContactState.NONE,

@@ -20,6 +20,7 @@ from cutting_trainer.node_common.operating_state import CrtkState
 TURNED_FRAME = Transform(translation=(0.01, 0, 0.02), rotation_rpy_deg=(20, -30, 70), scale=2.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('device', 'force_scale'),
     [

@@ -238,13 +238,16 @@ def test_test_command_of_an_installation_says_that_the_tests_are_in_the_source(
 
 
 def test_extra_arguments_of_the_test_command_reach_pytest() -> None:
-    *others, beside, alone = all_checks(['-k', 'patch', '--maxfail=1'], Path('/tmp/x'), 'usual')
+    *others, beside, live, alone = all_checks(
+        ['-k', 'patch', '--maxfail=1'], Path('/tmp/x'), 'usual'
+    )
     assert [check.name for check in others] == ['ruff check', 'ruff format', 'mypy']
-    for tests, part in ((beside, 'beside'), (alone, 'alone')):
+    for tests, part in ((beside, 'beside'), (live, 'live'), (alone, 'alone')):
         assert tests.argv[1:3] == ('-m', 'pytest')
         assert tests.argv[-3:] == ('-k', 'patch', '--maxfail=1')
         assert {'--tier=usual', f'--part={part}', f'--basetemp=/tmp/x/{part}'} < set(tests.argv)
-    assert '--numprocesses=auto' in beside.argv and '--numprocesses=auto' not in alone.argv
+    assert '--numprocesses=auto' in beside.argv and '--numprocesses=2' in live.argv
+    assert not any(a.startswith('--numprocesses') for a in alone.argv)
 
 
 def test_the_quick_tier_needs_no_graph_and_no_types() -> None:

@@ -15,7 +15,7 @@ pytest.importorskip('rclpy')
 
 from cutting_trainer.session.node_commands import MODULES, node_environment
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = 89

@@ -36,6 +36,8 @@ from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.streaming import cut_client
 from cutting_trainer.tissue_sim.streaming.messages import delta_into
 
+pytestmark = pytest.mark.long
+
 CUT = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_2' / 'straight_cut'
 PERIOD = 1 / 30
 

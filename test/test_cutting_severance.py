@@ -22,13 +22,14 @@ from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.cutting.cut_invariants import check_area, check_mesh, cut_face_area
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope='module')
 def plate() -> Organ:
     return slab((12, 12, 2))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ('ratio', 'seed'),
     [
@@ -95,7 +96,6 @@ def test_strokes_that_cross_near_their_ends_free_a_plug():
     assert run.error == '' and run.free
 
 
-@pytest.mark.long
 def test_elements_around_a_node_put_on_the_cut_are_divided_anew(cloud):
     run = measure(cloud, curved(cloud, 'loop', np.random.default_rng(1015)))
     assert run.error == '' and run.faces == 0

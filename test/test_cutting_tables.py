@@ -203,6 +203,7 @@ def test_only_nodes_on_the_cut_are_parted_within_an_element(decompositions):
             assert components(len(star), links) == (2 if parted else 1)
 
 
+@pytest.mark.long
 def test_children_stay_positive_wherever_on_its_edge_or_face_a_new_node_lies():
     rng = np.random.default_rng(0)
     for edges, nodes in states():

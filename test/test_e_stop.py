@@ -28,7 +28,7 @@ from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.node_commands import BRIDGE_NODE, node_command, node_environment
 from cutting_trainer.session.supervisor import Event, Supervisor
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 FELT = K * DEPTH
 SCENE = """
@@ -37,7 +37,7 @@ device: {profile: dvrk_mtm, e_stop_button: 1}
 haptics: {soft_start: 0.0, device_timeout: 0.5, stale_after: 1.0}
 """
 """A test that gets no turn is no fault here."""
-PRESSES = 100
+PRESSES = 40
 """How often E-STOP is pressed while words are sent."""
 
 

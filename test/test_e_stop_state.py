@@ -45,6 +45,7 @@ def test_a_press_is_told_again_and_again_until_a_node_says_that_it_holds(
     assert state.start_command(BRIDGE) == BRIDGE
 
 
+@pytest.mark.long
 def test_a_node_that_was_put_in_the_place_of_a_dead_one_is_not_started_twice(
     tmp_path: Path,
 ) -> None:

@@ -1,7 +1,7 @@
 """Two independent readers read every bag that the tests of this run have made; it runs last.
 
 Bags are found where the tests make them, in pytest's folder of temporary files: `trainer test` has
-one for each of the two parts. One that was cut off, as a test wanted it, is repaired first, in a
+one for each part. One that was cut off, as a test wanted it, is repaired first, in a
 copy.
 """
 

@@ -138,6 +138,7 @@ def closed_path(random, ticks=400):
     return path + np.array([0.0, 0.0, RADIUS + 1e-3])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('ratio', [1.0, 1.5])
 def test_no_closed_path_takes_energy_out(ratio):
     """The spring as it is computed, on 200 random paths that begin and end above the ground."""

@@ -25,7 +25,7 @@ from cutting_trainer.session.node_commands import CUTTING_NODE, node_command, no
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.supervisor import Event, Supervisor
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 __all__ = ['ledger']
 PATIENCE_S = 1.5

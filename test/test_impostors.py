@@ -13,7 +13,7 @@ from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 DOMAIN = 87
 SCENE = """

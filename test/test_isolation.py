@@ -17,7 +17,7 @@ from cutting_trainer.session.node_commands import MODULES, node_environment
 
 pytest.importorskip('rclpy')
 pytestmark = [
-    pytest.mark.alone,
+    pytest.mark.live,
     pytest.mark.skipif(bool(missing_rights()), reason=missing_rights()),
 ]
 

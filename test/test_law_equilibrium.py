@@ -11,6 +11,8 @@ from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.elasticity.stiffening_equilibrium import LawEquilibrium
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize(
     ('case', 'edge'), [('twist 90', 0.0067), ('press 50 %', 0.0067), ('punch 30 %', 0.0055)]

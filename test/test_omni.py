@@ -42,7 +42,7 @@ def test_a_force_is_held_for_30_ms_and_no_longer():
         assert latch.force(43 * MILLISECOND) == (0, 0, 0)
 
 
-@pytest.mark.real_time
+@pytest.mark.live
 @pytest.mark.thorough
 def test_a_driver_of_omni_msgs_is_an_arm_after_crtk(others_messages):
     ours = node_environment(DOMAIN)

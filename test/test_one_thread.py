@@ -19,7 +19,7 @@ from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.alone
 
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason='BLAS has one thread on one core')

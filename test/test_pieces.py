@@ -146,6 +146,7 @@ def pushed_plug(gravity=(0.0, 0.0, 0.0)):
     return dynamics, loose
 
 
+@pytest.mark.long
 def test_a_loose_piece_comes_to_rest_within_two_seconds_and_costs_nothing_then():
     dynamics, loose = pushed_plug()
     for _ in range(60):

@@ -18,7 +18,7 @@ from cutting_trainer.session import probe_command as command
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.probe_command import Emulation, ProbeOptions, run_probe
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 
 @pytest.fixture(autouse=True)

@@ -79,7 +79,7 @@ def publishing(domain: int) -> Any:
     return running([sys.executable, '-c', PUBLISHER], node_environment(domain), 'ready')
 
 
-@pytest.mark.real_time
+@pytest.mark.live
 def test_a_node_that_is_killed_and_started_again_is_never_taken_for_two(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -114,6 +114,7 @@ def test_layers_of_a_stiffening_law_in_series_are_each_in_its_own_strain(stress:
     assert np.abs(force[~top & (mesh.fixed == 0)]).max() < 1e-6 * np.abs(force).max()
 
 
+@pytest.mark.long
 def test_a_pressed_skin_on_fat_is_that_of_quadratic_elements() -> None:
     """A layered block between rough plates, against scikit-fem on a mesh twice as fine."""
     import skfem

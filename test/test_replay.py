@@ -237,7 +237,7 @@ def hand_player(context: rclpy.Context, playhead: Playhead, bag: Bag) -> HandPla
     return player
 
 
-@pytest.mark.real_time
+@pytest.mark.live
 def test_the_hand_goes_once_the_bridge_is_enabled_and_presses_its_button_again(
     context: rclpy.Context, pressed: Bag
 ) -> None:
@@ -273,7 +273,7 @@ def test_the_hand_goes_once_the_bridge_is_enabled_and_presses_its_button_again(
         node.destroy_node()
 
 
-@pytest.mark.real_time
+@pytest.mark.live
 def test_a_bridge_that_was_enabled_too_shortly_to_be_heard_ends_the_replay(
     context: rclpy.Context,
 ) -> None:
@@ -307,7 +307,7 @@ def test_a_bridge_that_says_nothing_is_not_waited_for_for_ever(context: rclpy.Co
         player.stop()
 
 
-@pytest.mark.real_time
+@pytest.mark.live
 def test_a_session_is_shown_as_it_was_and_ends_when_somebody_else_publishes(
     context: rclpy.Context,
 ) -> None:
@@ -404,7 +404,7 @@ class Terminal:
         return termios.tcgetattr(self._theirs) == self._settings
 
 
-@pytest.mark.real_time
+@pytest.mark.live
 def test_keys_of_a_terminal_pause_a_replay_step_it_and_end_it() -> None:
     options = ('--as-recorded', '--loop', '--start', '2', '--rate', '0.5', '--domain', 'free')
     terminal = Terminal('replay', str(SAMPLE), *options)
@@ -427,7 +427,7 @@ def test_keys_of_a_terminal_pause_a_replay_step_it_and_end_it() -> None:
         terminal.process.wait()
 
 
-@pytest.mark.real_time
+@pytest.mark.live
 @pytest.mark.thorough
 def test_the_recorded_hand_cuts_the_tissue_again(tmp_path: Path) -> None:
     command = [

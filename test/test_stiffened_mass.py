@@ -11,6 +11,8 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
 
+pytestmark = pytest.mark.long
+
 MIDDLE = np.array([0.0125, 0.01, 0.02])
 
 
