@@ -36,8 +36,10 @@ class EmulatedArm:
 
     Attributes:
         true_position, true_velocity: of the mass [m], [m/s], shape (3,).
+        pose: position and orientation, shape (7,).
         position: as the encoders have it [m], shape (3,).
         orientation: quaternion x y z w, shape (4,).
+        twist: velocity and angular velocity, shape (6,).
         velocity: from the encoders, filtered [m/s], shape (3,).
         angular_velocity: [rad/s], base axes, shape (3,).
         force: of the motors on the hand, base axes [N], shape (3,).
@@ -69,11 +71,11 @@ class EmulatedArm:
         self._age = 0
         self.true_position = hand.position.copy()
         self.true_velocity = np.zeros(3)
-        self.position = np.empty(3)
+        self.pose, self.twist = np.empty(7), np.zeros(6)
+        self.position, self.orientation = self.pose[:3], self.pose[3:]
+        self.velocity, self.angular_velocity = self.twist[:3], self.twist[3:]
         _quantise(self.true_position, settings.encoder_resolution, self.position)
-        self.orientation = hand.orientation.copy()
-        self.velocity = np.zeros(3)
-        self.angular_velocity = np.zeros(3)
+        self.orientation[:] = hand.orientation
         self.force = np.zeros(3)
         self.watchdog_trips = 0
         self.rejections = rejections or RejectionStatistics()
