@@ -264,9 +264,7 @@ class ForcePath:
             return ''
         known = known and enabled
         self._pose[:] = pose.values
-        code = safety.pose_gate(self._pose[:3], self._pose[3:]) or (
-            self._motion.judge(self._pose, pose.stamp_ns, known=known)
-        )
+        code = self._motion.judge(self._pose, pose.stamp_ns, known=known)
         if code != safety.OK:
             self.rejections.add(POSE, MessageError(safety.POSE_FAULTS[code]))
             return safety.POSE_FAULTS[code]
