@@ -1,12 +1,32 @@
 """Records of one tick of the force path: the commanded wrench and the reported contact."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from cutting_trainer.haptic_bridge.proxy.kernels import STATE
+from cutting_trainer.haptic_bridge.proxy.proxy import Touch
+from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.node_common.kernels import kernel
 
-_NOWHERE = ([0] * 9, [0.0] * 9, [0.0] * 3, [0.0] * 3)
+_CONTACT = record_type(
+    [
+        ('nodes', 'i8', (9,)),
+        ('weights', 'f8', (9,)),
+        ('device', 'f8', (3,)),
+        ('proxy', 'f8', (3,)),
+        ('point', 'f8', (3,)),
+        ('normal', 'f8', (3,)),
+        ('external_force', 'f8', (3,)),
+        ('coupling_stiffness', 'f8'),
+        ('blade', 'f8', (2, 3)),
+        ('proxy_radius', 'f8'),
+        ('blade_facing', 'f8', (3,)),
+    ]
+)
+"""Fields of `Contact` from the nodes on; all of 8 bytes."""
+_NOWHERE = Touch(np.zeros(1, STATE))
 
 
 class Tick(NamedTuple):
@@ -25,54 +45,61 @@ class Tick(NamedTuple):
     fault: str
 
 
-def contact_values(
-    sequence: int,
-    state: int,
-    surface: Surface | None,
-    touched: Any,
-    tool: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    spring: tuple[float, float],
-    mode: int,
-) -> tuple[float, ...]:
-    """Return the values of a contact, in the order of `ContactCodec`.
+class ContactReport:
+    """Packs the contact of a tick.
 
     Args:
-        sequence: of the tick.
-        state: NONE, TOUCHING or INSIDE.
-        surface: the newest of the tissue.
-        touched: contact of the proxy, or the triangle it approaches; None while it is not used.
-        tool: tip [m], shape (3,), force on the tissue [N], shape (3,), blade [m], shape (2, 3),
-            direction that its edge faces, shape (3,).
-        spring: stiffness of the coupling [N/m], radius of the tool [m].
-        mode: of the tool, one of `ToolMode`.
+        state: of the force path, dtype `force_kernels.STATE`, shape (1,).
+        stiffness: of the coupling [N/m].
+        radius: of the tool [m].
     """
-    # Lists: for three numbers an operation of numpy takes ten times as long.
-    stiffness, radius = spring
-    tip, external = tool[0].tolist(), tool[1].tolist()
-    proxy = [t - e / stiffness for t, e in zip(tip, external, strict=True)]
-    revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
-    nodes, weights, point, normal = _NOWHERE
-    if touched is not None:
-        nodes = [max(node, 0) for node in touched.nodes.tolist()]
-        weights, normal = touched.weights.tolist(), touched.normal.tolist()
-        contact, position = touched.contact.tolist(), touched.position.tolist()
-        point = [p + (c - q) for p, c, q in zip(proxy, contact, position, strict=True)]
-    return (
-        sequence,
-        state,
-        revision,
-        topology,
-        *nodes,
-        *weights,
-        *tip,
-        *proxy,
-        *point,
-        *normal,
-        *external,
-        stiffness,
-        *tool[2].ravel().tolist(),
-        radius,
-        0,  # the tool's number in the list of the scene
-        mode,
-        *tool[3].tolist(),
-    )
+
+    def __init__(self, state: np.ndarray, stiffness: float, radius: float) -> None:
+        self._state = state
+        self._contact = np.zeros(1, _CONTACT)
+        self._contact['coupling_stiffness'], self._contact['proxy_radius'] = stiffness, radius
+        self._nodes = self._contact['nodes'][0]
+        numbers = self._contact.view(np.float64)[len(self._nodes) :]
+        self._numbers, self._facing = numbers[:-3], numbers[-3:]
+
+    def values(
+        self, sequence: int, state: int, surface: Surface | None, touched: Touch | None, mode: int
+    ) -> tuple[float, ...]:
+        """Return the values of a contact, in the order of `ContactCodec`.
+
+        Args:
+            sequence: of the tick.
+            state: NONE, TOUCHING or INSIDE.
+            surface: the newest of the tissue.
+            touched: contact of the proxy, or the triangle it approaches; None while it is not used.
+            mode: of the tool, one of `ToolMode`.
+        """
+        revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
+        touch = _NOWHERE if touched is None else touched
+        _pack(self._state, touch.state, touched is not None, self._contact)
+        return (
+            sequence,
+            state,
+            revision,
+            topology,
+            *self._nodes.tolist(),
+            *self._numbers.tolist(),
+            0,  # the tool's number in the list of the scene
+            mode,
+            *self._facing.tolist(),
+        )
+
+
+@kernel(nogil=True)
+def _pack(state: np.ndarray, touch: np.ndarray, touched: bool, contact: np.ndarray) -> None:
+    """Write tool and touch to a contact; where the proxy is not used, its point is zero."""
+    s, t, c = state[0], touch[0], contact[0]
+    for k in range(9):
+        c.nodes[k], c.weights[k] = max(t.nodes[k], 0), t.weights[k]
+    for k in range(3):
+        c.device[k], c.external_force[k] = s.tip[k], s.external[k]
+        c.proxy[k] = s.tip[k] - s.external[k] / c.coupling_stiffness
+        c.point[k] = c.proxy[k] + (t.contact[k] - t.position[k]) if touched else 0.0
+        c.normal[k] = t.normal[k]
+        c.blade[0, k], c.blade[1, k] = s.blade[0, k], s.blade[1, k]
+        c.blade_facing[k] = s.facing[k]

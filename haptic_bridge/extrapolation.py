@@ -23,7 +23,7 @@ MAX_EXTRAPOLATION = 3.0
 """Length of an extrapolation in sample intervals: one to compute, one to wait, one lost."""
 MIN_SAMPLE_DISTANCE_M = 5e-5
 """[m] Samples closer than this differ by encoder noise only: the force is held instead."""
-_NONE = np.zeros(3)
+_NONE = np.zeros((2, 3))
 _MAX_STIFFNESS_RATIO = 2.0
 """Factor by which the stiffness may change since the newest sample."""
 
@@ -300,9 +300,9 @@ def push(
     *,
     topology: int,
     state: int,
-    torque: np.ndarray = _NONE,
+    torque: np.ndarray = _NONE[0],
     arms: np.ndarray = _NONE,
-    immersed: np.ndarray = _NONE[:2],
+    immersed: np.ndarray = _NONE[0, :2],
 ) -> None:
     """Add a sample. A change of connectivity or of the contact's state removes older samples.
 
@@ -320,15 +320,30 @@ def push(
         arms: from the tool's tip to root and tip of the blade in that contact [m], shape (2, 3).
         immersed: as in `TissueSample`, shape (2,).
     """
+    arrays = (position, force, torque, stiffness, depth, arms, immersed)
+    _push(history, time, topology, state, *(np.asarray(array, np.float64) for array in arrays))
+
+
+@kernel(nogil=True)
+def _push(
+    history, time, topology, state, position, force, torque, stiffness, depth, arms, immersed
+):
     h = history[0]
-    same = h['topology'] == topology and h['state'] == state
-    h['count'] = min(h['count'] + 1, 2) if same else 1
-    values = (('time', time), ('position', position), ('force', force), ('torque', torque))
-    for name, value in values:
-        h[name][0] = h[name][1]
-        h[name][1] = value
+    same = h.topology == topology and h.state == state
+    h.count = min(h.count + 1, 2) if same else 1
+    h.time[0] = h.time[1]
+    h.time[1] = time
+    for k in range(3):
+        h.position[0, k], h.force[0, k], h.torque[0, k] = (
+            h.position[1, k],
+            h.force[1, k],
+            h.torque[1, k],
+        )
+        h.position[1, k], h.force[1, k], h.torque[1, k] = position[k], force[k], torque[k]
+        h.depth[k] = depth[k]
     if np.any(stiffness):
-        h['stiffness'] = stiffness
-    h['depth'], h['arms'], h['immersed'] = depth, arms, immersed
-    h['topology'] = topology
-    h['state'] = state
+        h.stiffness[:] = stiffness
+    h.arms[:] = arms
+    h.immersed[:] = immersed
+    h.topology = topology
+    h.state = state

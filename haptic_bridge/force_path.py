@@ -14,7 +14,7 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, force_kernels, safety
 from cutting_trainer.haptic_bridge.contact_plausibility import MAX_STEP_AHEAD, ContactPlausibility
-from cutting_trainer.haptic_bridge.contact_values import Tick, contact_values
+from cutting_trainer.haptic_bridge.contact_values import ContactReport, Tick
 from cutting_trainer.haptic_bridge.devices.motion_gate import MotionGate
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import surface_stiffness
@@ -97,11 +97,10 @@ class ForcePath:
         self._setup = force_kernels.make_setup(tool, device, haptics, profile)
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
-        names = ('force', 'wrench', 'tip', 'external', 'blade', 'arms')
-        self._force, self._wrench, self._tip, self._external, self._blade, self._arms = map(
+        names = ('force', 'wrench', 'tip', 'blade', 'arms')
+        self._force, self._wrench, self._tip, self._blade, self._arms = map(
             self._s.__getitem__, names
         )
-        self._facing = self._s['facing']
         self._plausibility = ContactPlausibility(tool, tool.coupling_stiffness)
         self._length = math.dist(tool.blade_root, tool.blade_tip)
         if any(tool.blade_facing):  # spine and flat do not cut: they stretch the coupling
@@ -110,7 +109,8 @@ class ForcePath:
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._grips = friction.sliding > 0.0
         self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
-        self._tail = (tool.coupling_stiffness, tool.radius)
+        self._coupling = tool.coupling_stiffness
+        self._report = ContactReport(self._state, tool.coupling_stiffness, tool.radius)
         self._pose = np.zeros(7)
         self._motion = MotionGate()
         self._pose_stamp = self._pose_ns = 0
@@ -243,15 +243,7 @@ class ForcePath:
         if self._contact != NONE:
             self.contact_time += elapsed
         self.max_force = max(self.max_force, self.force_norm)
-        contact = contact_values(
-            self._sequence,
-            self._contact,
-            surface,
-            touched,
-            (self._tip, self._external, self._blade, self._facing),
-            self._tail,
-            self.mode,
-        )
+        contact = self._report.values(self._sequence, self._contact, surface, touched, self.mode)
         return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
 
     def _take_pose(self, now_ns: int, pose: StampedMessage | None, enabled: bool) -> str:
@@ -264,9 +256,7 @@ class ForcePath:
             return ''
         known = known and enabled
         self._pose[:] = pose.values
-        code = safety.pose_gate(self._pose[:3], self._pose[3:]) or (
-            self._motion.judge(self._pose, pose.stamp_ns, known=known)
-        )
+        code = self._motion.judge(self._pose, pose.stamp_ns, known=known)
         if code != safety.OK:
             self.rejections.add(POSE, MessageError(safety.POSE_FAULTS[code]))
             return safety.POSE_FAULTS[code]
@@ -313,7 +303,7 @@ class ForcePath:
             held = max(math.hypot(*reaction.force), math.hypot(*reaction.torque) / self._length)
             self._s['held'] = min(self._s['held'], held + float(self._setup['slack'][0]))
         elif reaction.stiffness.any():
-            reported = surface_stiffness(reaction.stiffness, self._tail[0])
+            reported = surface_stiffness(reaction.stiffness, self._coupling)
             self._plausibility.update_stiffness(self._state, now_ns, reported)
         answered = self._began <= reaction.sequence <= self._sequence and self._contact == TOUCHING
         if reaction.state == INSIDE or answered:
@@ -398,9 +388,8 @@ class ForcePath:
         ground = self._undented.surface
         assert ground is not None
         touched = self._proxy.step(ground, self._undented.blend(now_ns), self._tip)
-        self._s['proxy'] = self._proxy.place
-        slot = self._sequence % _MAX_PENDING_CONTACTS
-        self._depths[slot] = self._proxy.place - self._tip
+        self._s['proxy'] = place = self._proxy.place
+        self._depths[self._sequence % _MAX_PENDING_CONTACTS] = place - self._tip
         self._contact = TOUCHING if touched.touching else NONE
         if self._contact != before:
             extrapolation.clear(self._history)

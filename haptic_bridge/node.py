@@ -51,9 +51,9 @@ from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MESH_POLL_PERIOD_S = 0.003
-"""[s] between two polls for meshes of the simulation."""
+"""[s] between two polls for a mesh of the simulation, while one is due."""
 STATE_POLL_PERIOD_S = 0.02
-"""[s] between two polls of the operating state, while the bridge works."""
+"""[s] between two polls of the operating state and for any mesh, while the bridge works."""
 GRAPH_CHECK_PERIOD_S = 0.25
 """[s] between two checks of the graph for a subscriber of the force, while force is on."""
 WATCHED = (f'{ros.ARM}/measured_cp', ros.FORCE, ros.MESH, ros.MESH_UPDATES)
@@ -168,8 +168,9 @@ class HapticBridge(ManagedNode):
         """
         due = 0.0
         while not stop.is_set():
-            self._follower.follow_mesh()
             now = time.monotonic()
+            if now >= due or self._follower.mesh_is_due:
+                self._follower.follow_mesh()
             if now >= due:
                 due = now + STATE_POLL_PERIOD_S
                 try:
@@ -262,7 +263,7 @@ class HapticBridge(ManagedNode):
             if tick.fault:
                 self._machine.fault(tick.fault)
             contact = self._contact_codec.encode(tick.contact_stamp_ns, tick.contact)
-            self._contact.publish(contact)
+            ros.publish_raw(self._contact, contact)
         except Exception as error:
             self._machine.fault(f'the force loop failed: {type(error).__name__}: {error}')
             self._send((0.0,) * 6, now)
@@ -284,7 +285,7 @@ class HapticBridge(ManagedNode):
     def _send(self, wrench: tuple[float, ...], now: int) -> None:
         """Publish a force, stamped with the time [ns] at which it was computed."""
         wrench = self._convention.force(wrench)
-        self._wrench.publish(self._wrench_codec.encode(self._epoch + now, wrench))
+        ros.publish_raw(self._wrench, self._wrench_codec.encode(self._epoch + now, wrench))
 
     def _watch_state(self) -> None:
         # The largest: a thread preempted between the two readings gives too small a value.

@@ -10,7 +10,7 @@ at once.
 
 import numpy as np
 
-from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.kernels import inner
 
 OK, NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE, JUMP, ROTATION_JUMP = range(6)
 POSE_FAULTS = {
@@ -38,7 +38,7 @@ def norm(v: np.ndarray) -> float:
     return np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
-@kernel(nogil=True)
+@inner
 def pose_gate(position: np.ndarray, orientation: np.ndarray) -> int:
     """Check a device pose.
 
@@ -61,7 +61,7 @@ def pose_gate(position: np.ndarray, orientation: np.ndarray) -> int:
     return OK
 
 
-@kernel(nogil=True)
+@inner
 def motion_gate(pose: np.ndarray, before: np.ndarray, elapsed: float) -> int:
     """Check the motion of a device between two poses.
 
@@ -97,7 +97,7 @@ def state_gate(enabled: bool, force: np.ndarray) -> None:
         force[:] = 0.0
 
 
-@kernel(nogil=True)
+@inner
 def freshness(age: float, stale_after: float, fade: float) -> float:
     """Return the gain by the age [s] of the data.
 
@@ -106,7 +106,7 @@ def freshness(age: float, stale_after: float, fade: float) -> float:
     return min(max(1.0 - (age - stale_after) / fade, 0.0), 1.0)
 
 
-@kernel(nogil=True)
+@inner
 def soft_start(elapsed: float, duration: float) -> float:
     """Return the gain by the time since the force was enabled [s]: 0 to 1 within duration [s]."""
     return min(elapsed / duration, 1.0) if duration > 0.0 else 1.0

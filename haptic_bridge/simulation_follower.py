@@ -12,6 +12,8 @@ from cutting_trainer.node_common.rejections import require_frame
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.tissue_sim.streaming.mesh_follower import MeshFollower
 
+_REVISION = ForceSampleCodec.fields['revision'].start
+
 
 class SimulationFollower:
     """Follows the simulation: its forces in the fast loop, its meshes in a thread beside it.
@@ -34,6 +36,7 @@ class SimulationFollower:
         self._codec = ForceSampleCodec()
         self._watch = StreamMonitor(ros.FORCE, queues=True)
         self._late = 0
+        self._revision = -1
         self._force = ros.polled(node, ForceSample, ros.FORCE, qos.NEWEST_BEST_EFFORT)
 
     @property
@@ -52,6 +55,13 @@ class SimulationFollower:
             'stale_meshes': self._follower.stale,
         }
 
+    @property
+    def mesh_is_due(self) -> bool:
+        """Return whether the newest force is of another revision than the surface: the mesh of a
+        frame is sent just after its force.
+        """
+        return self.surface is None or self.surface.revision != self._revision
+
     def cause(self, now_ns: int) -> str:
         """Return why the forces cannot be trusted at this time [ns]; '' if they can."""
         return self._watch.cause(now_ns)
@@ -67,6 +77,7 @@ class SimulationFollower:
             if taken is None:
                 return None, now_ns
             sample = self._codec.decode(taken[0])
+            self._revision = sample.values[_REVISION]
             require_frame(ros.FORCE, sample.frame_id)
             problem = self._watch.see(taken[1], sample.stamp_ns, now_ns)
         except Exception as error:

@@ -140,15 +140,16 @@ class StampedCodec:
                 f'{self.name} with a frame_id of {length - 1} bytes has '
                 f'{_HEADER.size + whole.size} bytes, got {size}',
             )
-        frame, *values = body.unpack_from(data, _HEADER.size)
+        unpacked = body.unpack_from(data, _HEADER.size)
+        frame, values = unpacked[0], unpacked[1:]
         if body is not whole:
-            values += [0] * (self._values - len(values))
+            values += (0,) * (self._values - len(values))
         name = self._frames.get(frame)
         if name is None:
             if len(self._frames) >= _FRAME_CACHE_SIZE:
                 self._frames.clear()
             name = self._frames[frame] = self._frame_name(frame)
-        return StampedMessage(seconds * _NANOSECONDS + nanoseconds, name, tuple(values))
+        return StampedMessage(seconds * _NANOSECONDS + nanoseconds, name, values)
 
     def believed(self, data: bytes) -> StampedMessage:
         """Return the decoded message after a plausibility check of its numbers.

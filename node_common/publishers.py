@@ -107,7 +107,7 @@ class PublisherMonitor:
         return self.cause
 
     def _judge(self, topic: str, now: float) -> str:
-        count = self._node.count_publishers(topic)
+        count = self._node.handle.get_count_publishers(topic)  # its name is resolved already
         known = count == self._counts[topic] and now - self._asked[topic] < NAME_QUERY_PERIOD_S
         if not known:  # the query is expensive, and grows with each publisher
             self._counts[topic], self._asked[topic] = count, now

@@ -96,6 +96,29 @@ def test_writer_is_not_held_up_by_another_that_is_frozen_while_it_writes(
             time.sleep(0.01)
 
 
+def wakes(pid: int) -> int:
+    """How often the thread for the timers of the middleware has waited in a process."""
+    (thread,) = (
+        task
+        for task in Path(f'/proc/{pid}/task').iterdir()
+        if (task / 'comm').read_text().startswith('dds.ev')
+    )
+    status = (thread / 'status').read_text()
+    return int(status.partition('\nvoluntary_ctxt_switches:')[2].split()[0])
+
+
+def test_samples_start_no_timer_each(environment: dict[str, str]) -> None:
+    with process('reader', environment), process('steady', environment) as steady:
+        time.sleep(2.0)  # participants find each other
+        while sends(steady, 0.0) == SENT:
+            pass  # of before
+        before, began = wakes(steady.pid), time.monotonic()
+        for _ in range(50):
+            assert sends(steady, PATIENCE) >= SENT
+        periods = (time.monotonic() - began) / 0.01
+        assert wakes(steady.pid) - before < 20 + 4 * periods
+
+
 def test_nodes_share_no_memory_and_listen_on_this_machine_only(environment: dict[str, str]) -> None:
     with process('reader', environment) as reader:
         assert '/dev/shm/fastrtps' not in Path(f'/proc/{reader.pid}/maps').read_text()

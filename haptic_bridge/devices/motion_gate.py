@@ -3,12 +3,17 @@
 import numpy as np
 
 from cutting_trainer.haptic_bridge import safety
+from cutting_trainer.haptic_bridge.proxy.record_type import record_type
+from cutting_trainer.node_common.kernels import kernel
 
 _SECOND = 1e-9
+_GATE = record_type(
+    [('last', 'f8', (7,)), ('last_ns', 'i8'), ('anchor', 'f8', (7,)), ('anchor_ns', 'i8')]
+)
 
 
 class MotionGate:
-    """Compares each pose with the one before, and with one some milliseconds earlier.
+    """Checks each pose, and compares it with the one before and one some milliseconds earlier.
 
     Two stamps of a 1 kHz stream can be closer than the motion between them took, so that a step
     counts as at least `NOMINAL_PERIOD` long. Over a few poses such steps add up: there the stamps
@@ -16,30 +21,39 @@ class MotionGate:
     """
 
     def __init__(self) -> None:
-        self._last, self._anchor = np.zeros(7), np.zeros(7)
-        self._last_ns = self._anchor_ns = 0
+        self._gate = np.zeros(1, _GATE)
 
     def judge(self, pose: np.ndarray, stamp_ns: int, *, known: bool) -> int:
-        """Return OK, JUMP or TURN of `safety`; a pose that is OK becomes the one before.
+        """Return OK or a key of `safety.POSE_FAULTS`; a pose that is OK becomes the one before.
 
         Args:
             pose: position [m] and quaternion x y z w, shape (7,).
             stamp_ns: of the pose [ns], later than the one before.
             known: the pose before is that of the same motion.
         """
-        if not (known and self._last_ns):
-            self._anchor[:] = pose
-            self._anchor_ns = stamp_ns
-        else:
-            step = (stamp_ns - self._last_ns) * _SECOND
-            window = (stamp_ns - self._anchor_ns) * _SECOND + safety.NOMINAL_PERIOD_S
-            code = safety.motion_gate(pose, self._last, max(step, safety.NOMINAL_PERIOD_S))
-            code = code or safety.motion_gate(pose, self._anchor, window)
-            if code != safety.OK:
-                return int(code)
-            if window > safety.MIN_WINDOW_S:
-                self._anchor[:] = self._last
-                self._anchor_ns = self._last_ns
-        self._last[:] = pose
-        self._last_ns = stamp_ns
-        return safety.OK
+        return int(_judge(self._gate, pose, stamp_ns, known))
+
+
+@kernel(nogil=True)
+def _judge(gate: np.ndarray, pose: np.ndarray, stamp_ns: int, known: bool) -> int:
+    g = gate[0]
+    code = safety.pose_gate(pose[:3], pose[3:])
+    if code != safety.OK:
+        return code
+    if known and g.last_ns != 0:
+        step = (stamp_ns - g.last_ns) * _SECOND
+        window = (stamp_ns - g.anchor_ns) * _SECOND + safety.NOMINAL_PERIOD_S
+        code = safety.motion_gate(pose, g.last, max(step, safety.NOMINAL_PERIOD_S))
+        if code == safety.OK:
+            code = safety.motion_gate(pose, g.anchor, window)
+        if code != safety.OK:
+            return code
+        if window > safety.MIN_WINDOW_S:
+            g.anchor[:] = g.last
+            g.anchor_ns = g.last_ns
+    else:
+        g.anchor[:] = pose
+        g.anchor_ns = stamp_ns
+    g.last[:] = pose
+    g.last_ns = stamp_ns
+    return safety.OK

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -49,8 +50,13 @@ class DriverFaults:
 
     def force(self, force: Sequence[float]) -> tuple[float, ...]:
         """Return the force of the motors [N] for a commanded one, shape (3,)."""
-        x, y, z = (self.gain * _about_diagonal(self.turn) @ force).tolist()
-        return x, y, z
+        x, y, z = force
+        return tuple(a * x + b * y + c * z for a, b, c in self._rows)
+
+    @cached_property
+    def _rows(self) -> list[list[float]]:
+        rows: list[list[float]] = (self.gain * _about_diagonal(self.turn)).tolist()
+        return rows
 
     def pose(self, values: tuple[float, ...]) -> tuple[float, ...]:
         """Return a pose as it is sent: position and quaternion."""

@@ -1,8 +1,10 @@
 """The operator's hand: scripted or guided target, tremor, and the spring that pulls the tool."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,7 +36,7 @@ class HandScript:
         times: [s] when each pose is reached, ascending from 0, shape (n,).
         positions: [m], shape (n, 3).
         orientations: quaternions x y z w, signs continuous, shape (n, 4).
-        phase_ends: [s] by phase, shape (p,).
+        phase_ends: [s] by phase, ascending.
         phases: name and kind by phase.
         buttons: whether the button is pressed, by phase.
     """
@@ -42,11 +44,11 @@ class HandScript:
     times: np.ndarray
     positions: np.ndarray
     orientations: np.ndarray
-    phase_ends: np.ndarray
+    phase_ends: tuple[float, ...]
     phases: tuple[tuple[str, str], ...]
     buttons: tuple[bool, ...]
 
-    @property
+    @cached_property
     def seconds(self) -> float:
         """Return the duration [s]."""
         return float(self.times[-1])
@@ -60,8 +62,7 @@ class HandScript:
         return self.buttons[self._index_at(time)]
 
     def _index_at(self, time: float) -> int:
-        index = int(np.searchsorted(self.phase_ends, time, side='right'))
-        return min(index, len(self.phases) - 1)
+        return min(bisect_right(self.phase_ends, time), len(self.phases) - 1)
 
 
 def compile_script(
@@ -92,7 +93,7 @@ def compile_script(
         times=np.cumsum(durations),
         positions=positions,
         orientations=_orientations(poses, tissue_from_device),
-        phase_ends=np.cumsum(ends),
+        phase_ends=tuple(np.cumsum(ends).tolist()),
         phases=tuple((phase.name or phase.kind, phase.kind) for phase in settings.phases),
         buttons=tuple(phase.button for phase in settings.phases),
     )

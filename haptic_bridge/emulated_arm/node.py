@@ -39,6 +39,7 @@ from cutting_trainer.node_common.ros import (
     Diagnostics,
     listen,
     polled,
+    publish_raw,
     stamp,
     take_numbered,
 )
@@ -218,16 +219,16 @@ class ArmNode(ManagedNode):
 
     def _publish(self, stamp: int) -> None:
         arm, spoken = self._arm, self._convention
-        pose = spoken.to_device_pose((*arm.position.tolist(), *arm.orientation.tolist()))
-        twist = spoken.to_device_twist((*arm.velocity.tolist(), *arm.angular_velocity.tolist()))
+        pose = spoken.to_device_pose(tuple(arm.pose.tolist()))
+        twist = spoken.to_device_twist(tuple(arm.twist.tolist()))
         wrench = spoken.force((*arm.force.tolist(), *_NO_TORQUE))
         frame = self._faults.frame(self._frame_id, time.monotonic() - self._started)
         if frame != self._frame_id:
             self._frame_id, self._cp = frame, PoseStampedCodec(frame)
             self._faults = replace(self._faults, frame_after=0.0)
-        self._measured_cp.publish(self._cp.encode(stamp, self._faults.pose(pose)))
-        self._measured_cv.publish(self._cv.encode(stamp, twist))
-        self._measured_cf.publish(self._cf.encode(stamp, wrench))
+        publish_raw(self._measured_cp, self._cp.encode(stamp, self._faults.pose(pose)))
+        publish_raw(self._measured_cv, self._cv.encode(stamp, twist))
+        publish_raw(self._measured_cf, self._cf.encode(stamp, wrench))
 
     def _guide(self, data: bytes) -> None:
         """Decode a goal for the hand; an invalid one is rejected, and the hand stays."""

@@ -30,6 +30,7 @@ class Touch:
     Where nothing is touched, contact to weights are those of the nearest point; all weights are 0
     if there is none.
         valid: False where the last input was not finite; nothing has changed then.
+        state: for compiled functions, dtype STATE, shape (1,).
     """
 
     position: np.ndarray
@@ -39,7 +40,7 @@ class Touch:
     weights: np.ndarray
 
     def __init__(self, state: np.ndarray) -> None:
-        self._state = state
+        self.state = state
         for name in ('position', 'contact', 'normal', 'nodes', 'weights'):
             view = state[name][0]
             view.flags.writeable = False
@@ -49,12 +50,12 @@ class Touch:
     @property
     def touching(self) -> bool:
         """Return whether the surface holds the proxy back."""
-        return bool(self._state['touching'][0])
+        return bool(self.state['touching'][0])
 
     @property
     def depth(self) -> float:
         """Return the distance of device and proxy [m]."""
-        return float(self._state['depth'][0])
+        return float(self.state['depth'][0])
 
 
 class Proxy:
