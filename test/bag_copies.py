@@ -1,4 +1,4 @@
-"""Copies of bags in which something is otherwise."""
+"""Copies of bags in which something is otherwise, and the processor that computed a bag."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -8,6 +8,17 @@ from cutting_trainer.bags.reader import Recorded, open_bag
 from cutting_trainer.bags.topic_names import POSE
 from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec
+from cutting_trainer.node_common.code_identity import identity_here, identity_of
+
+
+def is_of_this_processor(folder: Path) -> bool:
+    """Return whether a bag's kernels were compiled for this kind of processor.
+
+    Only then is a computation the same bit for bit. On another kind the rounding grows where an
+    edge slips.
+    """
+    code, here = identity_of(open_bag(folder).custom_data), identity_here()
+    return code is not None and (code.target, code.features) == (here.target, here.features)
 
 
 def rewritten(

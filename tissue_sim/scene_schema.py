@@ -84,8 +84,8 @@ class MaterialSettings(SceneModel):
         default=0.0,
         ge=0,
         le=2,
-        description='dry friction of the tool on the surface, and of cut faces on each other: '
-        'tangential over normal force of what slides [-], 0 to 2; 0: none',
+        description='dry friction of the tool on the surface: tangential over normal force of what '
+        'slides [-], 0 to 2; 0: none',
     )
     static_friction_ratio: float = Field(
         default=1.0,
@@ -96,7 +96,7 @@ class MaterialSettings(SceneModel):
 
     @property
     def dry_friction(self) -> Friction:
-        """The friction of the tool on the surface, and of cut faces."""
+        """The friction of the tool on the surface."""
         return Friction(self.friction, self.static_friction_ratio)
 
     @model_validator(mode='after')

@@ -6,6 +6,7 @@ import numpy as np
 
 from cutting_trainer.tissue_sim.contact.blade import NOT_TURNED, Blade, Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.coupling import FREE, PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.cut_contact import CUT_FRICTION
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction, GrippingSprings
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutCommand, Frame, ToolContact
 from cutting_trainer.tissue_sim.contact.tool_spring import ContactName, ToolSprings, footprint_force
@@ -39,7 +40,7 @@ class TissueSimulation:
         stretch: relative displacement of the fixed nodes along x, y and z before the session (0.05:
             by 5 %): the pre-tension under which a cut opens.
         contact: how the load of a tool is spread, see `ToolSprings`.
-        friction: of the tool on the surface, and of cut faces on each other.
+        friction: of the tool on the surface.
         gravity: acceleration [m/s^2]; `Dynamics.settle` finds the shape at rest under it.
 
     Raises:
@@ -62,7 +63,7 @@ class TissueSimulation:
     ) -> None:
         self.mesh = mesh
         self.material = material
-        self.dynamics = Dynamics(mesh, material, model, stepping, active, gravity, friction.sliding)
+        self.dynamics = Dynamics(mesh, material, model, stepping, active, gravity, CUT_FRICTION)
         self.step = 0
         self.state = ContactState.NONE
         self.elements_cut = 0
