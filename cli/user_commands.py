@@ -44,7 +44,7 @@ def import_mesh(
     edge: Annotated[
         float | None,
         typer.Option(
-            min=1e-4, max=1.0, help='Length of edge to aim at [m] (default: some 3000 tetrahedra).'
+            min=1e-4, max=1.0, help='Length of edge to aim at [m] (default: some 4000 tetrahedra).'
         ),
     ] = None,
     rests_on: Annotated[
