@@ -14,8 +14,6 @@ SHARES = (np.arange(POINTS) + 0.5) / POINTS
 """Places of the points along the edge, from its tip to its root."""
 _TESTS = 8
 """Places of a piece at which the end of the tissue is looked for."""
-_MIN_PIECES = 3
-"""Pieces between the ends of the edge in the tissue from which on its stretch is known."""
 _MAX_STEPS = 100
 """Places at which tissue is looked for between an edge in the air and the device's."""
 SETTLED = 1e-6
@@ -46,7 +44,7 @@ class Tissue(NamedTuple):
     """The tissue as operand of the kernels.
 
     Attributes:
-        positions, rest: nodes now and at rest [m], shape (n, 3).
+        positions: nodes now [m], shape (n, 3).
         tetrahedra, neighbors: of the mesh, shape (m, 4).
         near: tetrahedra among which points are looked for, shape (k,).
         opened: triangles of the surface that cuts have opened, shape (c, 3).
@@ -54,7 +52,6 @@ class Tissue(NamedTuple):
     """
 
     positions: np.ndarray
-    rest: np.ndarray
     tetrahedra: np.ndarray
     neighbors: np.ndarray
     near: np.ndarray
@@ -92,30 +89,6 @@ def immerse(edge, device, tissue):
         _enter(edge, i, tissue, found[i])
     _measure_spans(edge, device, tissue)
     _relax(edge, device, tissue, before)
-
-
-@inner
-def rest_length(edge, tissue):
-    """Return the length at rest over that now, of the edge between its ends in the tissue.
-
-    Toughness is work by area at rest: tissue that the blade compresses along its edge is cut in
-    full.
-    """
-    first, last = -1, -1
-    for i in range(POINTS):
-        if edge.spans[i] > 0.0:
-            first, last = i if first < 0 else first, i
-    if last - first < _MIN_PIECES:
-        return 1.0
-    rest = now = 0.0
-    for c in range(3):
-        at_rest = 0.0
-        for k in range(4):
-            at_rest += edge.weights[last, k] * tissue.rest[edge.corners[last, k], c]
-            at_rest -= edge.weights[first, k] * tissue.rest[edge.corners[first, k], c]
-        rest += at_rest * at_rest
-        now += (edge.points[last, c] - edge.points[first, c]) ** 2
-    return np.sqrt(rest / now)
 
 
 @inner
@@ -205,8 +178,7 @@ def _measure_spans(edge, device, tissue):
             reached = 0
             while reached < _TESTS and found[reached] >= 0:
                 reached += 1
-            # The end is somewhere between the last place inside and the first outside.
-            edge.spans[i] += min((reached + 0.5) / _TESTS, 1.0) - 0.5
+            edge.spans[i] += reached / _TESTS - 0.5
         if inside[i]:
             edge.spans[i] = max(edge.spans[i], 1.0 / _TESTS)
 
