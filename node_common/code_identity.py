@@ -85,9 +85,13 @@ class CodeIdentity:
             then, now = getattr(self, name), getattr(here, name)
             if then != now:
                 found.append(f'{_WORDS[name]} has another version: bag {then}, here {now}')
-        if (self.target, self.features) != (here.target, here.features):
+        if not self.is_of_processor_of(here):
             found.append(f'the processor is another one: bag {self._processor(here)}')
         return found
+
+    def is_of_processor_of(self, here: 'CodeIdentity') -> bool:
+        """Return whether both are compiled for the same kind of processor."""
+        return (self.target, self.features) == (here.target, here.features)
 
     def rounds_otherwise_only(self, here: 'CodeIdentity') -> bool:
         """Return whether the processor or libraries differ, but not the trainer's own code."""
