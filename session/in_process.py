@@ -97,11 +97,11 @@ class Tissue:
         self._method = method
         self._cut = CutTransaction(simulation)
 
-    def frame(self, contact: ToolContact | None) -> Frame:
-        """Return one frame under a contact."""
+    def frame(self, *contacts: ToolContact | None) -> Frame:
+        """Return one frame under the contacts of the tools."""
         if self._cut.due:
             self._cut.resolve(*self._answer())
-        frame = self.simulation.frame(contact)
+        frame = self.simulation.frame(*contacts)
         self._cut.ask(frame)
         return frame
 

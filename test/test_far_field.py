@@ -73,7 +73,7 @@ def test_reduced_stiffness_is_galerkins_whatever_was_cut_and_wherever_the_tool_w
         n = mesh.node_count
         inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1 / elastic.mass), 3)
         u, v = np.zeros((2, 3 * n + far.extra))
-        region = far.choose(u, v, np.zeros((n, 3)), inverse, tool)
+        region = far.choose(u, v, np.zeros((n, 3)), inverse, [tool])
         free = np.zeros(n, bool)
         free[far.nodes] = True
         grid = far._grid

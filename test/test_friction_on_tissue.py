@@ -51,7 +51,7 @@ def footprint(session: InProcess) -> Footprint:
     """The nodes that share the load now."""
     touch = session.path._proxy.touch
     nodes, weights = touch.nodes[:3], touch.weights[:3] / touch.weights[:3].sum()
-    footprints = session.tissue.simulation._springs._footprints
+    footprints = session.tissue.simulation.tools[0]._springs._footprints
     hertz = np.sqrt(RADIUS * 2e-3)
     return footprints.around(nodes, weights, footprints.radius(nodes, weights, hertz))
 
@@ -109,7 +109,7 @@ def test_a_recorded_state_goes_on_bit_for_bit(friction):
     for x in np.linspace(0.0, 2e-3, 100):
         contact = tool_contact(session.tick(PLACE + np.array([x, 0.0, 0.0])).contact)
     twin = from_state(state_of(simulation))
-    assert type(twin._springs) is type(simulation._springs)
+    assert type(twin.tools[0]._springs) is type(simulation.tools[0]._springs)
     for _ in range(5):
         forces = simulation.frame(contact).force, twin.frame(contact).force
         assert forces[0].tobytes() == forces[1].tobytes()

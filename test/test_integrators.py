@@ -5,7 +5,7 @@ import pytest
 from meshes import box, irregular_box
 from pairs import EXPLICIT, every_pair
 
-from cutting_trainer.tissue_sim.contact.coupling import HOLD, PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, NO_SPRINGS, PUSH, Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -43,7 +43,7 @@ def vibrate(integrator: IntegratorName, steps: int, seconds: float) -> float:
     exact = shapes @ (np.exp(-rates * seconds) * swing)
     u, v = shapes.sum(axis=1), np.zeros(len(root))
     Integrator(integrator, alpha, beta, tolerance=1e-13).step(
-        model.operands(), inverse, model.diagonal, Coupling().spring(mesh.rest), u, v,
+        model.operands(), inverse, model.diagonal, NO_SPRINGS, u, v,
         seconds / steps, steps,
     )  # fmt: skip
     return float(np.abs(u - exact).max() / np.abs(shapes).max())
@@ -73,9 +73,7 @@ def free_energy(integrator: IntegratorName, share: float, steps: int) -> np.ndar
     v, stepper, energies = np.zeros_like(u), Integrator(integrator, 0.0, 0.0), []
     start = model.evaluate(u.reshape(-1, 3))[1]
     for _ in range(steps):
-        stepper.step(
-            model.operands(), inverse, model.diagonal, Coupling().spring(mesh.rest), u, v, dt, 1
-        )
+        stepper.step(model.operands(), inverse, model.diagonal, NO_SPRINGS, u, v, dt, 1)
         energies.append(model.evaluate(u.reshape(-1, 3))[1] + mass @ v**2 / 2)
     return np.array(energies) / start
 
@@ -126,10 +124,9 @@ def grown_by(integrator: IntegratorName, name: ModelName, nu: float, share: floa
     v = np.zeros_like(u)
     start = model.evaluate(u.reshape(-1, 3))[1]
     stepper = Integrator(integrator, material.alpha, material.beta)
-    nothing = Coupling().spring(mesh.rest)
     with np.errstate(all='ignore'):
         for _ in range(10 if integrator != 'implicit' else 1):
-            stepper.step(model.operands(), inverse, model.diagonal, nothing, u, v, dt, 1000)
+            stepper.step(model.operands(), inverse, model.diagonal, NO_SPRINGS, u, v, dt, 1000)
             if not np.abs(u).max() < 1.0:
                 return np.inf
     return model.evaluate(u.reshape(-1, 3))[1] / start

@@ -321,7 +321,7 @@ def test_without_what_cutting_remembered_the_bag_lacks_it_and_nothing_differs(
         lambda s, m: s.dynamics.model.tensor_mass.tensors.columns,
         lambda s, m: s.dynamics.model.tensor_mass.tensors.used,
         lambda s, m: s.dynamics.model._neighbours._rows.columns,
-        lambda s, m: s._blade._state.corners,
+        lambda s, m: s.blade._state.corners,
         lambda s, m: m.mesh.links.tetrahedra,
         lambda s, m: m.method._tables.edge_nodes,
         lambda s, m: m.method._tables.children,

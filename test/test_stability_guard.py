@@ -119,7 +119,7 @@ def test_a_blade_in_a_tissue_that_diverges_within_a_frame_is_not_asked_where_it_
 
     tissue.dynamics.velocity[:] = speed
     with np.errstate(all='ignore'):
-        assert tissue.dynamics.advance(Coupling(), WatchingTool()).diverged
+        assert tissue.dynamics.advance(Coupling(), tools=[WatchingTool()]).diverged
     assert all(asked)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from meshes import box, irregular_box
 
-from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling, springs_of
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -105,7 +105,14 @@ def pressed(seconds: float, stiffness: float) -> tuple[ElasticModel, np.ndarray,
     omega = FrequencyBound(model, inverse).omega + np.sqrt(stiffness / model.mass[top])
     dt = 0.8 * step_bound('rk4', omega, material.alpha, material.beta)
     Integrator('rk4', 20.0, 2e-3).step(
-        model.operands(), inverse, model.diagonal, load.spring(nodes), u, v, dt, int(seconds / dt)
+        model.operands(),
+        inverse,
+        model.diagonal,
+        springs_of([load], nodes),
+        u,
+        v,
+        dt,
+        int(seconds / dt),
     )
     return model, u.reshape(-1, 3), load
 

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
-from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.contact.coupling import NO_SPRINGS
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, Integrator, IntegratorName
 from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
@@ -209,7 +209,7 @@ def grows(
     inverse = _inverse_mass(model)
     u = _RELATIVE_AMPLITUDE * length * mode / np.abs(mode).max()
     v = np.zeros_like(u)
-    spring = Coupling().spring(model.mesh.rest)
+    spring = NO_SPRINGS
     method = Integrator(integrator, task.material.alpha, task.material.beta)
     sizes = [float(np.linalg.norm(u))]
     for _ in range(_STEPS // _BLOCK):

@@ -27,7 +27,7 @@ from bench.accuracy.peer_beam import Beam, Result, Solver, make_beam, measure, s
 from bench.accuracy.peer_solvers import MujocoFlex, NewtonTetrahedra
 from bench.accuracy.problems import material
 from bench.common.clock import keep
-from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.contact.coupling import NO_SPRINGS
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.motion.integrators import Integrator
 
@@ -50,7 +50,7 @@ class Own:
         self.dt = stable_step(self._model, self._inverse)
         self._push = self.dt * at.load.ravel() * self._inverse
         self._integrator = Integrator('symplectic_euler', 0.0, 0.0)
-        self._spring, self._operands = Coupling().spring(at.mesh.rest), self._model.operands()
+        self._spring, self._operands = NO_SPRINGS, self._model.operands()
         self._u, self._v = np.zeros_like(self._push), np.zeros_like(self._push)
 
     def step(self, count: int) -> None:

@@ -16,7 +16,7 @@ from bench.accuracy.integrator_limits import highest_mode, measured_limit
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
-from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.contact.coupling import NO_SPRINGS
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
@@ -157,7 +157,7 @@ def orders(integrator: IntegratorName) -> Order:
     def error(steps: int, dt: float) -> float:
         u, v = np.zeros(len(inverse)), np.zeros(len(inverse))
         u[free] = start
-        spring = Coupling().spring(mesh.rest)
+        spring = NO_SPRINGS
         method = Integrator(integrator, 0.0, 0.0)
         method.step(model.operands(), inverse, model.diagonal, spring, u, v, dt, steps)
         turn = omega * dt * steps
@@ -182,7 +182,7 @@ def efficiency(integrator: IntegratorName, material: Material = THESIS) -> Effic
     inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1 / model.mass), 3)
     u, v = np.full(len(inverse), 1e-6), np.zeros(len(inverse))
     method = Integrator(integrator, material.alpha, material.beta)
-    operands, spring = model.operands(), Coupling().spring(mesh.rest)
+    operands, spring = model.operands(), NO_SPRINGS
     times = []
     for _ in range(31):
         start = time.thread_time()

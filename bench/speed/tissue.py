@@ -11,7 +11,7 @@ from bench.common.clock import Figure, by_turns, figure, stream
 from bench.common.meshes import PLANE_TOLERANCE_M, kuhn_block
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance
-from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.contact.coupling import NO_SPRINGS
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import (
@@ -166,7 +166,7 @@ def steps_of(
         count: of steps.
     """
     method = Integrator(integrator, model.material.alpha, model.material.beta)
-    spring, operands = Coupling().spring(model.mesh.rest), model.operands()
+    spring, operands = NO_SPRINGS, model.operands()
     begin = 1e-5 * np.random.default_rng(0).standard_normal(len(inverse))
     begin[inverse == 0.0] = 0.0
 
@@ -217,7 +217,7 @@ def palpation(size: int, name: ModelName, nodes: int) -> list[Figure]:
         'integrate': _Part(dynamics, '_integrate'),
         'choose the region': _Part(dynamics._active, 'choose'),
         'energy and guard': _Part(dynamics, '_motion'),
-        'contact stiffness': _Part(simulation._stiffness, 'matrix'),
+        'contact stiffness': _Part(simulation.tools[0]._stiffness, 'matrix'),
         'reaction': _Part(simulation, '_reaction'),
         'encode': _Part(encoder, 'encode'),
     }

@@ -9,6 +9,7 @@ the tool, hertz * force^(2/3) (1 + bend * force^(2/3)), less the part `seen` by 
 never stiffer than the coupling spring alone.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -22,22 +23,24 @@ PUSH = 1
 HOLD = 2
 
 
-class Spring(NamedTuple):
-    """A coupling as operand of the kernels.
+class Springs(NamedTuple):
+    """The couplings of all tools as operand of the kernels, t of them.
 
     Attributes:
-        mode, nodes, weights, normal: see `Coupling`.
-        ends: position of the tool's end at the start and end of the frame [m], shape (2, 3).
-        anchor: rest position of the tissue's end [m], shape (3,).
-        scalars: see `Coupling.scalars`.
+        modes: see `Coupling`, shape (t,).
+        nodes, weights: likewise; a short row repeats its first node with weight 0, shape (t, c).
+        normals: likewise, shape (t, 3).
+        ends: positions of the tools' ends at the start and end of the frame [m], shape (t, 2, 3).
+        anchors: rest positions of the tissue's ends [m], shape (t, 3).
+        scalars: see `Coupling.scalars`, shape (t, 9).
     """
 
-    mode: int
+    modes: np.ndarray
     nodes: np.ndarray
     weights: np.ndarray
-    normal: np.ndarray
+    normals: np.ndarray
     ends: np.ndarray
-    anchor: np.ndarray
+    anchors: np.ndarray
     scalars: np.ndarray
 
 
@@ -120,24 +123,46 @@ class Coupling:
         """Return the tissue's end of the spring [m], shape (3,); `positions` has shape (n, 3)."""
         return self.weights @ positions[self.nodes]
 
-    def spring(self, rest: np.ndarray) -> Spring:
-        """Return the operand of the kernels for rest positions [m], shape (n, 3)."""
-        return Spring(
-            self.mode,
-            self.nodes,
-            self.weights,
-            self.normal,
-            np.array([self.start, self.end]),
-            self.weights @ rest[self.nodes],
-            self.scalars,
-        )
-
     def force(self, positions: np.ndarray, share: float = 1.0) -> np.ndarray:
         """Return the force on the tissue after a share of the frame [N], shape (3,)."""
         out = np.zeros(3)
         stretch = self.start + share * (self.end - self.start) - self.point(positions)
         spring_force(self.mode, stretch, self.normal, self.scalars, out)
         return out
+
+
+def springs_of(couplings: Sequence[Coupling], rest: np.ndarray) -> Springs:
+    """Return the operand of the kernels for the couplings that are not free.
+
+    Args:
+        couplings: of the tools.
+        rest: rest positions [m], shape (n, 3).
+    """
+    acting = [coupling for coupling in couplings if coupling.mode != FREE]
+    count = len(acting)
+    width = max((len(coupling.nodes) for coupling in acting), default=0)
+    nodes, weights = np.zeros((count, width), np.int64), np.zeros((count, width))
+    for row, coupling in enumerate(acting):
+        nodes[row] = coupling.nodes[0]
+        nodes[row, : len(coupling.nodes)] = coupling.nodes
+        weights[row, : len(coupling.nodes)] = coupling.weights
+    return Springs(
+        np.array([coupling.mode for coupling in acting], np.int64),
+        nodes,
+        weights,
+        np.array([coupling.normal for coupling in acting]).reshape(count, 3),
+        np.array([(coupling.start, coupling.end) for coupling in acting]).reshape(count, 2, 3),
+        np.array([c.weights @ rest[c.nodes] for c in acting]).reshape(count, 3),
+        np.array([coupling.scalars for coupling in acting]).reshape(count, 9),
+    )
+
+
+NO_SPRINGS = springs_of((), np.zeros((0, 3)))
+
+
+def held_nodes(couplings: Sequence[Coupling]) -> np.ndarray:
+    """Return the nodes that tools load, with repeats, shape (c,)."""
+    return np.concatenate([np.zeros(0, np.int64), *(coupling.nodes for coupling in couplings)])
 
 
 class Tool(Protocol):
@@ -238,76 +263,82 @@ def spring_force(mode, stretch, normal, scalars, out):
 
 
 @inner
-def spring_stretch(spring, at, u, stretch):
+def spring_stretch(springs, tool, at, u, stretch):
     """Compute the tool's end minus the tissue's end.
 
     Args:
-        spring: see `Spring`.
+        springs: see `Springs`.
+        tool: which one.
         at: elapsed share of the frame.
         u: displacement by coordinate [m], shape (3 n,).
         stretch: output [m], shape (3,).
     """
-    ends = spring.ends
+    ends = springs.ends[tool]
     for i in range(3):
-        stretch[i] = ends[0, i] + at * (ends[1, i] - ends[0, i]) - spring.anchor[i]
-        for c in range(spring.nodes.shape[0]):
-            stretch[i] -= spring.weights[c] * u[3 * spring.nodes[c] + i]
+        stretch[i] = ends[0, i] + at * (ends[1, i] - ends[0, i]) - springs.anchors[tool, i]
+        for c in range(springs.nodes.shape[1]):
+            stretch[i] -= springs.weights[tool, c] * u[3 * springs.nodes[tool, c] + i]
 
 
 @inner
-def force_of_spring(spring, at, u, out):
-    """Compute the force of the spring on the tissue.
+def forces_of_springs(springs, at, u, out):
+    """Compute the forces of the springs on the tissue.
 
     Args:
-        spring: see `Spring`.
+        springs: see `Springs`.
         at: elapsed share of the frame.
         u: displacement by coordinate [m], shape (3 n,).
-        out: [N], shape (3,).
+        out: [N], shape (t, 3).
     """
     stretch = np.empty(3)
-    spring_stretch(spring, at, u, stretch)
-    spring_force(spring.mode, stretch, spring.normal, spring.scalars, out)
+    for tool in range(springs.modes.shape[0]):
+        spring_stretch(springs, tool, at, u, stretch)
+        mode, normal = springs.modes[tool], springs.normals[tool]
+        spring_force(mode, stretch, normal, springs.scalars[tool], out[tool])
 
 
 @inner
-def subtract_spring(spring, at, u, f, out):
-    """Subtract the spring's force on the tissue from the elastic force.
+def subtract_springs(springs, at, u, f, out):
+    """Subtract the springs' forces on the tissue from the elastic force.
 
     Args:
         f: elastic force [N], shape (3 n,).
-        spring, at, u, out: as for `force_of_spring`.
+        springs, at, u, out: as for `forces_of_springs`.
     """
-    force_of_spring(spring, at, u, out)
-    for c in range(spring.nodes.shape[0]):
-        for i in range(3):
-            f[3 * spring.nodes[c] + i] -= spring.weights[c] * out[i]
+    forces_of_springs(springs, at, u, out)
+    for tool in range(springs.modes.shape[0]):
+        for c in range(springs.nodes.shape[1]):
+            for i in range(3):
+                f[3 * springs.nodes[tool, c] + i] -= springs.weights[tool, c] * out[tool, i]
 
 
 @inner
-def spring_work(spring, force, u, last):
+def work_of_springs(springs, forces, u, last):
     """Return the work on the tissue since the last call, by the trapezoidal rule [J].
 
     Args:
-        spring: see `Spring`.
-        force: on the tissue now [N], shape (3,).
+        springs: see `Springs`.
+        forces: on the tissue now [N], shape (t, 3).
         u: displacement by coordinate [m], shape (3 n,).
-        last: force [N] and position [m] of the tissue's end at the last call; updated, shape (2,
-            3).
+        last: forces [N] and positions [m] of the tissue's ends at the last call; updated, shape
+            (t, 2, 3).
     """
     work = 0.0
-    for i in range(3):
-        place = 0.0
-        for c in range(spring.nodes.shape[0]):
-            place += spring.weights[c] * u[3 * spring.nodes[c] + i]
-        work += 0.5 * (force[i] + last[0, i]) * (place - last[1, i])
-        last[0, i] = force[i]
-        last[1, i] = place
+    for tool in range(springs.modes.shape[0]):
+        for i in range(3):
+            place = 0.0
+            for c in range(springs.nodes.shape[1]):
+                place += springs.weights[tool, c] * u[3 * springs.nodes[tool, c] + i]
+            way = place - last[tool, 1, i]
+            work += 0.5 * (forces[tool, i] + last[tool, 0, i]) * way
+            last[tool, 0, i] = forces[tool, i]
+            last[tool, 1, i] = place
     return work
 
 
 @inner
-def start_of_work(spring, u, last):
-    """Initialise `last` with the present position and zero force; return 0 J."""
-    force = np.zeros(3)
-    spring_work(spring, force, u, last)
+def start_of_work(springs, u, last):
+    """Initialise `last` with the present positions and zero force; return 0 J."""
+    forces = np.zeros((springs.modes.shape[0], 3))
+    work_of_springs(springs, forces, u, last)
     return 0.0

@@ -3,7 +3,7 @@
 The load of a sphere acts on a disc of Hertz's radius a, which may be smaller than an element. The
 nodes therefore share a smooth pressure on a disc that the mesh can resolve, and the coupling spring
 gets the difference: the settlement under Hertz's pressure less that under the smooth one, both of a
-half-space (`coupling.Spring`). The mesh has the part that is far from the tool; the part near it is
+half-space (`Springs`). The mesh has the part that is far from the tool; the part near it is
 exact.
 """
 

@@ -22,10 +22,15 @@ class ContactState(enum.IntEnum):
 
 
 class ToolMode(enum.IntEnum):
-    """Kind of a tool; numbers as in `Contact`. A palpator never goes in."""
+    """Kind of a tool; numbers as in `Contact`.
+
+    A palpator never goes in. A grasper holds what its jaws close on, until they open.
+    """
 
     SCALPEL = 0
     PALPATOR = 1
+    OPEN_GRASPER = 2
+    CLOSED_GRASPER = 3
 
 
 class CutCommand(enum.IntEnum):
@@ -135,6 +140,8 @@ class Frame:
         trouble: the error with its limit and cause; empty: none. Without `diverged`, shorter steps
             corrected it, or the tool was released.
         strain: of a model with a law, else None.
+        tool: number of the tool that feels it.
+        others: the same frame, as the other tools feel it, in order.
     """
 
     step: int
@@ -153,12 +160,19 @@ class Frame:
     trouble: str = ''
     strain: Strain | None = None
     turning: Turning = NOT_TURNED
+    tool: int = 0
+    others: tuple['Frame', ...] = ()
+
+    @property
+    def by_tool(self) -> tuple['Frame', ...]:
+        """The frame as each tool feels it."""
+        return (self, *self.others)
 
     @property
     def felt(self) -> tuple[float, ...]:
         """What a tool feels: the values of a `ForceSample` from `state` on."""
         vectors = np.concatenate([self.position, self.force, self.stiffness.ravel()])
-        scalars = (self.resistance, self.kinetic_energy, self.elastic_energy, 0)
+        scalars = (self.resistance, self.kinetic_energy, self.elastic_energy, self.tool)
         torque, most, immersed = self.turning
         return (
             int(self.state), *vectors.tolist(), *scalars, *torque.tolist(), most, *immersed.tolist()

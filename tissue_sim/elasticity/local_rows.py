@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.tissue_sim.contact.coupling import Spring
+from cutting_trainer.tissue_sim.contact.coupling import Springs
 from cutting_trainer.tissue_sim.elasticity.simd import (
     load_four,
     load_three,
@@ -64,9 +64,9 @@ class Locality(NamedTuple):
     local: np.ndarray
     rows: LocalRows
 
-    def spring(self, spring: Spring) -> Spring:
-        """Return the tool's coupling with local node numbers."""
-        return spring._replace(nodes=self.local[spring.nodes])
+    def springs(self, springs: Springs) -> Springs:
+        """Return the couplings of the tools with local node numbers."""
+        return springs._replace(nodes=self.local[springs.nodes])
 
 
 def locality(

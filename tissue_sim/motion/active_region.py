@@ -12,7 +12,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.local_rows import Locality
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, internal_force
 from cutting_trainer.tissue_sim.mesh.adjacency import intervals, without
@@ -81,9 +80,9 @@ def _measure(f, v, inverse_mass, seconds, tolerance, looked, quiet):
         quiet[i] = min(quiet[i] + 1, 1000) if slow else 0
 
 
-def _misses(region: Region, coupling: Coupling) -> bool:
-    """Return whether the tool holds a node outside the part."""
-    return region.place is not None and bool((region.place.local[coupling.nodes] < 0).any())
+def _misses(region: Region, held: np.ndarray) -> bool:
+    """Return whether a tool holds a node outside the part."""
+    return region.place is not None and bool((region.place.local[held] < 0).any())
 
 
 class ActiveRegion:
@@ -160,7 +159,7 @@ class ActiveRegion:
         v: np.ndarray,
         beta: float,
         inverse_mass: np.ndarray,
-        coupling: Coupling,
+        held: np.ndarray,
         seconds: float,
         met: tuple[np.ndarray, np.ndarray | None],
     ) -> Region:
@@ -174,7 +173,7 @@ class ActiveRegion:
             v: velocity [m/s], changed where nodes go to sleep, shape (3 n,).
             beta: damping in proportion to stiffness [s].
             inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
-            coupling: the tool's spring.
+            held: nodes that tools load, shape (h,).
             seconds: duration of a frame [s].
             met: nodes of cut faces in contact, with repeats, shape (c,), and their forces on all
                 nodes [N], shape (n, 3), None without any; they sleep together.
@@ -182,7 +181,7 @@ class ActiveRegion:
         if self.whole:
             operands = self._model.operands()
             return Region(operands.awake, operands, operands, None)
-        looked, operands = self._looked(coupling)
+        looked, operands = self._looked(held)
         damped, f = self._room(len(u))
         _ahead(operands.reach, u, v, beta, damped)
         internal_force(operands, damped, f, 1)
@@ -193,36 +192,36 @@ class ActiveRegion:
         tolerance = self._settings.tolerance
         _measure(f, v, inverse_mass, seconds, tolerance, looked, self._quiet)
         restless = looked[self._quiet[looked] < _CHOICES_TO_SLEEP]
-        seeds = np.concatenate([restless, coupling.nodes])
+        seeds = np.concatenate([restless, held])
         awake = self._model.neighbours.around(seeds, self._rings)
         if pressed is not None and np.isin(touching, awake).any():
             awake = self._model.neighbours.around(np.concatenate([seeds, touching]), self._rings)
         v.reshape(-1, 3)[without(self._awake, awake)] = 0.0
         region = self._region
-        if region is None or not np.array_equal(awake, self._awake) or _misses(region, coupling):
-            region = self._region = self._surround(awake, coupling)
+        if region is None or not np.array_equal(awake, self._awake) or _misses(region, held):
+            region = self._region = self._surround(awake, held)
         self._moved = grown(self._moved, self._model.mesh.node_count)
         self._moved[awake] = True
         return region
 
-    def _looked(self, coupling: Coupling) -> tuple[np.ndarray, Operands]:
+    def _looked(self, held: np.ndarray) -> tuple[np.ndarray, Operands]:
         """Return the examined nodes, sorted, and the operands for the force on them."""
         region = self._region
-        if region is not None and len(without(np.sort(coupling.nodes), self._near)) == 0:
+        if region is not None and len(without(np.sort(held), self._near)) == 0:
             return self._near, region.around
         neighbours = self._model.neighbours
-        looked = neighbours.around(np.concatenate([self._near, coupling.nodes]), 0)
+        looked = neighbours.around(np.concatenate([self._near, held]), 0)
         whole = len(looked) == self._model.mesh.node_count
         return looked, self._model.operands(None if whole else looked)
 
-    def _surround(self, awake: np.ndarray, coupling: Coupling) -> Region:
+    def _surround(self, awake: np.ndarray, held: np.ndarray) -> Region:
         """Make some nodes, sorted, the moving ones, shape (a,)."""
         model = self._model
         level = model.neighbours.levels(awake, 3)
         self._awake, self._near = awake, np.flatnonzero(level <= 1)
         n = model.mesh.node_count
         some = len(awake) < n and not self._implicit
-        part = model.part(awake, self._near, coupling.nodes) if some else None
+        part = model.part(awake, self._near, held) if some else None
         if part is not None:
             around = model.operands_within(level, 1)
             return Region(part.operands.awake, part.operands, around, part.place)

@@ -1,10 +1,18 @@
 """Dynamics of the tissue by frame: model, integrator, step, active region, divergence detector."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling, Spring, Tool
+from cutting_trainer.tissue_sim.contact.coupling import (
+    FREE,
+    Coupling,
+    Springs,
+    Tool,
+    held_nodes,
+    springs_of,
+)
 from cutting_trainer.tissue_sim.contact.cut_contact import NO_CUT_CONTACTS, CutContact, CutContacts
 from cutting_trainer.tissue_sim.contact.cut_contact_search import NO_NEAR_FACES, NearFaces
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
@@ -206,10 +214,10 @@ class Dynamics:
         if self.loads is not None:
             self.resume(self.loads.at_rest(self.displacement.copy()))
 
-    def bound(self, coupling: Coupling | None = None) -> float:
-        """Return the largest stable step [s], the coupling spring's stiffness included."""
+    def bound(self, couplings: Sequence[Coupling] = ()) -> float:
+        """Return the largest stable step [s], the stiffness of coupling springs included."""
         square = self.omega**2
-        if coupling is not None and coupling.mode != FREE:
+        for coupling in couplings:
             inverse = self.inverse_mass[3 * coupling.nodes]
             square += coupling.stiffness * float(np.sum(coupling.weights**2 * inverse))
         # Rounded up, so that only few different bounds are computed.
@@ -219,23 +227,23 @@ class Dynamics:
             self._bounds[omega] = step_bound(self.stepping.integrator, omega, m.alpha, m.beta)
         return self._bounds[omega]
 
-    def _substeps(self, coupling: Coupling) -> tuple[int, float]:
-        dt = self.stepping.safety * self.bound(coupling) / self._caution
+    def _substeps(self, couplings: Sequence[Coupling]) -> tuple[int, float]:
+        dt = self.stepping.safety * self.bound(couplings) / self._caution
         substeps = max(int(np.ceil(self._frame_time / dt)), self.stepping.min_substeps)
         substeps = max(substeps, self._caution)
         if substeps > self.stepping.max_substeps * self._caution:
             return self.stepping.max_substeps * self._caution, dt
         return substeps, self._frame_time / substeps
 
-    def advance(self, coupling: Coupling, tool: Tool | None = None) -> FrameMotion:
+    def advance(self, *couplings: Coupling, tools: Sequence[Tool] = ()) -> FrameMotion:
         """Integrate a frame; after divergence, retry it with shorter steps.
 
         A loose piece comes to rest, or falls where there is weight; pushed away, it stops at a
         distance of the tissue's length.
 
         Args:
-            coupling: the tool's spring.
-            tool: gives other springs within the frame; None: the spring stays.
+            couplings: springs of the tools at the start of the frame.
+            tools: give other springs within it; none: the springs stay.
         """
         if self.loads is not None:
             self.loads.refresh(self._u[: 3 * self.mesh.node_count])
@@ -249,14 +257,14 @@ class Dynamics:
             flat = self._u[: 3 * self.mesh.node_count]
             operands = self._far.operands() if self._far else self.model.operands()
             self._stiffened.begin(flat, self._frequency.omega, self.inverse_mass, operands)
-        substeps, dt = self._substeps(coupling)
-        self._hold_back(tool is None and coupling.mode == FREE)
+        substeps, dt = self._substeps(couplings)
+        self._hold_back(_is_free(couplings, tools))
         before = (self._u.copy(), self._v.copy())
         met = self.cut_contact.kept()
         relieved = None if self.loads is None else self.loads.kept()
         trouble = ''
         while True:
-            work, contacts = self._integrate(coupling, dt, substeps, tool)
+            work, contacts = self._integrate(couplings, dt, substeps, tools)
             motion = self._motion(dt, substeps, trouble, contacts)
             energy = motion.kinetic_energy + motion.elastic_energy
             found = self._detector.diagnose(self.displacement, energy, work)
@@ -268,7 +276,7 @@ class Dynamics:
             if self._hold_lost(*before):
                 trouble = f'{found}: a piece that nothing held, which stays there from now on'
                 continue
-            trouble = trouble or f'{found}: {self._cause(coupling, dt)}'
+            trouble = trouble or f'{found}: {self._cause(couplings, dt)}'
             self._u, self._v = before[0].copy(), before[1].copy()
             self._turn_back()
             known = not self.model.rotating and self.stepping.integrator != 'implicit'
@@ -330,29 +338,28 @@ class Dynamics:
         self._u, self._v = grown(self._u, size), grown(self._v, size)
         return self._u[:size], self._v[:size]
 
-    def _choose(self, coupling: Coupling, contacts: NearFaces) -> Region:
+    def _choose(self, couplings: Sequence[Coupling], contacts: NearFaces) -> Region:
         u, v = self._state()
         if isinstance(self._active, FarField):
-            if coupling.mode == FREE:
+            if _is_free(couplings):
                 self._active.relax(u, self._elastic.force, self.inverse_mass, self.omega)
                 self._elastic.whole(self.displacement)
-            return self._active.choose(u, v, self._elastic.force, self.inverse_mass, coupling)
+            return self._active.choose(u, v, self._elastic.force, self.inverse_mass, couplings)
         b = self.material.beta
         some = len(contacts.nodes) and not self._active.whole
         pressed = self.cut_contact.force(contacts, u, v) if some else None
         at = u, v, b, self.inverse_mass
         met = contacts.nodes.ravel(), pressed
-        return self._active.choose(*at, coupling, self._frame_time, met)
+        return self._active.choose(*at, held_nodes(couplings), self._frame_time, met)
 
     def _integrate(
-        self, coupling: Coupling, dt: float, substeps: int, tool: Tool | None
+        self, couplings: Sequence[Coupling], dt: float, substeps: int, tools: Sequence[Tool]
     ) -> tuple[float, NearFaces]:
-        """Move the tissue by a frame; return the work of the tool [J], and what is in contact."""
+        """Move the tissue by a frame; return the work of the tools [J], and what is in contact."""
         size = 3 * self.mesh.node_count
         moving = self._state()[1][:size]
         calm = self.loads is None or self.loads.settled
-        free = tool is None and coupling.mode == FREE
-        if free and calm and float(np.abs(moving).max()) < _AT_REST:
+        if _is_free(couplings, tools) and calm and float(np.abs(moving).max()) < _AT_REST:
             # Decay would continue into denormal numbers, at a hundred times the cost.
             if self._still >= _STILL_FRAMES:
                 moving[:] = 0.0
@@ -360,10 +367,10 @@ class Dynamics:
             self._still += 1
         else:
             self._still = 0
-        coupling = coupling if tool is None else tool.restart()
-        spring = coupling.spring(self.mesh.rest)
+        couplings = [tool.restart() for tool in tools] or couplings
+        springs = springs_of(couplings, self.mesh.rest)
         work, done, whole = 0.0, 0, np.array([[0, self.mesh.node_count]])
-        part, parts = 1, 1 if tool is None else tool.parts
+        part, parts = 1, max((tool.parts for tool in tools), default=1)
         region: Region | None = None
         adapt, look, near, contacts = 0, substeps, NO_NEAR_FACES, NO_NEAR_FACES
         faces: CutContacts | None = None
@@ -378,7 +385,7 @@ class Dynamics:
                 near, known = self.cut_contact.find(self.displacement, self.velocity, dt, substeps)
                 look = done + known
             if region is None or anew:
-                region = self._choose(coupling, near)
+                region = self._choose(couplings, near)
             if faces is None:
                 contacts = near.among(self._active.move(near.nodes))
                 faces = self._meeting(contacts, region)
@@ -394,18 +401,19 @@ class Dynamics:
             if self.loads is not None:
                 steps = min(steps, self.loads.substeps(dt) or steps)
             steps = min(steps, max(part * substeps // parts - done, 1), max(look - done, 1))
-            work += self._steps(region, spring, faces, dt, steps, first=done, total=substeps)
+            work += self._steps(region, springs, faces, dt, steps, first=done, total=substeps)
             done += steps
             if self.loads is not None:
                 spans = whole if self._active.whole else spans_of(self._active.near)
                 self.loads.advance(self._u[:size], dt * steps, spans)
-            if tool is not None and done >= part * substeps // parts:
+            if tools and done >= part * substeps // parts:
                 part += 1
                 if self._detector.has_left(self.displacement):
-                    break  # a diverged tissue holds no tool: the frame will be taken back
-                coupling = tool.after(done / substeps, self.positions)
-                spring = coupling.spring(self.mesh.rest)
-                if self._far is not None and not self._far.covers(coupling):
+                    break  # a diverged tissue holds no tools: the frame will be taken back
+                positions = self.positions
+                couplings = [tool.after(done / substeps, positions) for tool in tools]
+                springs = springs_of(couplings, self.mesh.rest)
+                if self._far is not None and not self._far.covers(couplings):
                     self._far.follow(*self._state(), size)
                     self._elastic.whole(self.displacement)
                     region = None
@@ -429,7 +437,7 @@ class Dynamics:
     def _steps(
         self,
         region: Region,
-        spring: Spring,
+        springs: Springs,
         faces: CutContacts,
         dt: float,
         steps: int,
@@ -437,7 +445,7 @@ class Dynamics:
         first: int,
         total: int,
     ) -> float:
-        """Move the nodes of a region by some substeps; return the work of the spring [J]."""
+        """Move the nodes of a region by some substeps; return the work of the springs [J]."""
         place = region.place
         at = slice(None) if place is None else place.at
         u, v = (values[at] for values in self._state())
@@ -453,7 +461,7 @@ class Dynamics:
             operands,
             inverse,
             diagonal[at],
-            spring if place is None else place.spring(spring),
+            springs if place is None else place.springs(springs),
             u,
             v,
             dt,
@@ -483,8 +491,8 @@ class Dynamics:
         strain = None if self._stiffened is None else self._stiffened.strain
         return FrameMotion(force, kinetic, elastic, substeps, slow, trouble, strain=strain)
 
-    def _cause(self, coupling: Coupling, dt: float) -> str:
-        name, bound = self.stepping.integrator, self.bound(coupling)
+    def _cause(self, couplings: Sequence[Coupling], dt: float) -> str:
+        name, bound = self.stepping.integrator, self.bound(couplings)
         limit = f'the {1e3 * bound:.3g} ms at which {name} is stable at {self.omega:.4g} rad/s'
         if dt > bound:
             return f'a step of {1e3 * dt:.3g} ms is above {limit}'
@@ -596,3 +604,8 @@ class Dynamics:
         if self._stiffened is not None:
             self._stiffened.follow_cut()
         self._touched.append(nodes)
+
+
+def _is_free(couplings: Sequence[Coupling], tools: Sequence[Tool] = ()) -> bool:
+    """Return whether no tool acts on the tissue."""
+    return not tools and all(coupling.mode == FREE for coupling in couplings)

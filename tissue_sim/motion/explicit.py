@@ -7,10 +7,10 @@ import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.contact.coupling import (
-    force_of_spring,
-    spring_work,
+    forces_of_springs,
     start_of_work,
-    subtract_spring,
+    subtract_springs,
+    work_of_springs,
 )
 from cutting_trainer.tissue_sim.contact.cut_contact import meet, subtract_pulls
 from cutting_trainer.tissue_sim.elasticity.models import internal_force
@@ -55,13 +55,13 @@ def _stage(f, inverse_mass, u, v, us, vs, du, dv, alpha, share, ahead):
 
 @kernel(error_model='numpy')
 def euler_steps(
-    operands, spans, inverse_mass, damping, spring, faces, u, v, work, dt, first, steps, total,
+    operands, spans, inverse_mass, damping, springs, faces, u, v, work, dt, first, steps, total,
     symplectic,
 ):  # fmt: skip
     """Compute steps of Euler's methods: v by its rate at the start of the step, u by the v at start
     or end.
 
-    Forward Euler (thesis 4.4.1) is unstable for any undamped spring, so the coupling spring gets
+    Forward Euler (thesis 4.4.1) is unstable for any undamped spring, so the coupling springs get
     the tissue's beta.
 
     Args:
@@ -69,7 +69,7 @@ def euler_steps(
         spans: intervals of moving nodes, shape (s, 2).
         inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
         damping: alpha [1/s] and beta [s].
-        spring: the coupling, with its law, see `coupling.Spring`.
+        springs: of the tools, see `coupling.Springs`.
         faces: contacts of cut faces, see `cut_contact.CutContacts`.
         u, v: displacement [m] and velocity [m/s], changed in place, shape (3 n,).
         work: scratch, shape (6, >= 3 n).
@@ -78,13 +78,14 @@ def euler_steps(
         symplectic: whether u uses the new v; else the old one (forward Euler).
 
     Returns:
-        Work of the spring on the tissue [J].
+        Work of the springs on the tissue [J].
     """
     alpha, beta = damping[0], damping[1]
     q, f = work[2, : u.shape[0]], work[3, : u.shape[0]]
     held = u if symplectic else q
-    force, last = np.zeros(3), np.zeros((2, 3))
-    done = start_of_work(spring, u, last)
+    tools = springs.modes.shape[0]
+    forces, last = np.zeros((tools, 3)), np.zeros((tools, 2, 3))
+    done = start_of_work(springs, u, last)
     _copy(operands.reach, u, q)
     for s in range(spans.shape[0]):
         a, b = 3 * spans[s, 0], 3 * spans[s, 1]
@@ -93,26 +94,26 @@ def euler_steps(
         internal_force(operands, q, f, 1)
         if faces.at.shape[0] > 0:
             subtract_pulls(faces, f)
-        if spring.mode != 0:
-            subtract_spring(spring, step / total, held, f, force)
+        if tools > 0:
+            subtract_springs(springs, step / total, held, f, forces)
             if not symplectic:
-                # Of the spring alone: its damping force does no work on the tissue.
-                force_of_spring(spring, step / total, u, force)
-            done += spring_work(spring, force, u, last)
+                # Of the springs alone: their damping force does no work on the tissue.
+                forces_of_springs(springs, step / total, u, forces)
+            done += work_of_springs(springs, forces, u, last)
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
             _euler(u[a:b], v[a:b], q[a:b], f[a:b], inverse_mass[a:b], alpha, beta, dt, symplectic)
         if faces.at.shape[0] > 0:
             meet(faces, u, v, q, beta, dt)
-    if spring.mode != 0:
-        force_of_spring(spring, (first + steps) / total, u, force)
-        done += spring_work(spring, force, u, last)
+    if tools > 0:
+        forces_of_springs(springs, (first + steps) / total, u, forces)
+        done += work_of_springs(springs, forces, u, last)
     return done
 
 
 @kernel(error_model='numpy')
 def rk4_steps(
-    operands, spans, inverse_mass, damping, spring, faces, u, v, work, dt, first, steps, total
+    operands, spans, inverse_mass, damping, springs, faces, u, v, work, dt, first, steps, total
 ):
     """Compute steps of the classical fourth-order Runge-Kutta method on u and v together.
 
@@ -123,8 +124,9 @@ def rk4_steps(
     size = u.shape[0]
     us, vs, q = work[0, :size], work[1, :size], work[2, :size]
     f, du, dv = work[3, :size], work[4, :size], work[5, :size]
-    force, last = np.zeros(3), np.zeros((2, 3))
-    done = start_of_work(spring, u, last)
+    tools = springs.modes.shape[0]
+    forces, last = np.zeros((tools, 3)), np.zeros((tools, 2, 3))
+    done = start_of_work(springs, u, last)
     _copy(operands.reach, u, q)
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
@@ -140,11 +142,11 @@ def rk4_steps(
             internal_force(operands, q, f, 1)
             if faces.at.shape[0] > 0:
                 subtract_pulls(faces, f)
-            if spring.mode != 0:
+            if tools > 0:
                 at = (step + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / total
-                subtract_spring(spring, at, us, f, force)
+                subtract_springs(springs, at, us, f, forces)
                 if stage == 0:
-                    done += spring_work(spring, force, u, last)
+                    done += work_of_springs(springs, forces, u, last)
             share = dt / 6.0 if stage == 0 or stage == 3 else dt / 3.0
             ahead = dt if stage == 2 else 0.5 * dt
             for s in range(spans.shape[0]):
@@ -159,7 +161,7 @@ def rk4_steps(
             v[a:b] += dv[a:b]
         if faces.at.shape[0] > 0:
             meet(faces, u, v, q, beta, dt)
-    if spring.mode != 0:
-        force_of_spring(spring, (first + steps) / total, u, force)
-        done += spring_work(spring, force, u, last)
+    if tools > 0:
+        forces_of_springs(springs, (first + steps) / total, u, forces)
+        done += work_of_springs(springs, forces, u, last)
     return done

@@ -9,10 +9,12 @@ has the mass of its far nodes, so that no frequency is above that of the whole t
 step is stable.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling
+from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling, held_nodes
 from cutting_trainer.tissue_sim.elasticity.coarse_rows import CoarseRows
 from cutting_trainer.tissue_sim.elasticity.corotational import KEPT
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, internal_force
@@ -80,11 +82,14 @@ def _weighed(level, columns, weights, inverse_mass, out):
 
 
 @kernel
-def _rank(rest, centre, out):
-    """Write squared distances from a place."""
+def _rank(rest, centres, out):
+    """Write squared distances from the nearest of some places."""
     for node in range(len(rest)):
-        x, y, z = rest[node, 0] - centre[0], rest[node, 1] - centre[1], rest[node, 2] - centre[2]
-        out[node] = x * x + y * y + z * z
+        out[node] = np.inf
+        for c in range(len(centres)):
+            x, y = rest[node, 0] - centres[c, 0], rest[node, 1] - centres[c, 1]
+            z = rest[node, 2] - centres[c, 2]
+            out[node] = min(out[node], x * x + y * y + z * z)
 
 
 @kernel(error_model='numpy')
@@ -156,7 +161,7 @@ def _relax(far, columns, weights, u, force, pull, inverse_mass, squared):
 
 
 class FarField:
-    """Free nodes around the tool, and the unknowns that move all others.
+    """Free nodes around the tools, and the unknowns that move all others.
 
     Where the tissue has strained or turned too much to be linear, nodes are free as well.
 
@@ -177,7 +182,7 @@ class FarField:
         self._stiffness = CoarseStiffness(model, self._grid)
         self._level = np.full(n, _LEVELS + 1, np.uint8)
         self._far = np.zeros(0, np.int64)
-        self._centre = np.zeros(0)
+        self._centres = np.zeros((0, 3))
         self._radius = 0.0
         self._mass = np.zeros(0)
         self._changed = True
@@ -206,9 +211,9 @@ class FarField:
         """Return the operands of the part that is evaluated as it is."""
         return self._model.operands_within(self._level[: self._model.mesh.node_count], 0)
 
-    def covers(self, coupling: Coupling) -> bool:
-        """Return whether the nodes that the tool holds are free."""
-        return coupling.mode == FREE or not self._level[coupling.nodes].any()
+    def covers(self, couplings: Sequence[Coupling]) -> bool:
+        """Return whether the nodes that tools load are free."""
+        return not self._level[held_nodes(couplings)].any()
 
     def choose(
         self,
@@ -216,7 +221,7 @@ class FarField:
         v: np.ndarray,
         force: np.ndarray,
         inverse_mass: np.ndarray,
-        coupling: Coupling,
+        couplings: Sequence[Coupling],
     ) -> Region:
         """Choose the free nodes, and begin anew from the present displacement.
 
@@ -225,13 +230,13 @@ class FarField:
             v: velocity; that of unknowns follows nodes that are not free any more [m/s].
             force: elastic force at u [N], shape (n, 3).
             inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
-            coupling: the tool's spring.
+            couplings: of the tools.
         """
         n, start = len(inverse_mass) // 3, len(inverse_mass)
         bent = self._bent(u, inverse_mass)
-        if self._moved_on(coupling) or (self._level[:n][bent > _BENT**2] > 0).any():
+        if self._moved_on(couplings) or (self._level[:n][bent > _BENT**2] > 0).any():
             before = self._level[:n] == 0
-            self._select(coupling, bent)
+            self._select(couplings, bent)
             self._weigh(v, inverse_mass, before)
         level = self._level[:n]
         operands = self.operands()
@@ -333,13 +338,22 @@ class FarField:
         around = self._model.neighbours.around(nodes, 1)
         self._stiffness.release_around(around, nodes)
 
-    def _moved_on(self, coupling: Coupling) -> bool:
-        if self._changed or not self.covers(coupling):
+    def _moved_on(self, couplings: Sequence[Coupling]) -> bool:
+        if self._changed or not self.covers(couplings):
             return True
-        if coupling.mode == FREE:
+        places = self._places(couplings)
+        if len(places) == 0:
             return False
-        way = coupling.weights @ self._model.mesh.rest[coupling.nodes] - self._centre
-        return bool(np.linalg.norm(way) > _MOVES * self._radius)
+        if len(places) != len(self._centres):
+            return True
+        ways = np.linalg.norm(places - self._centres, axis=1)
+        return bool((ways > _MOVES * self._radius).any())
+
+    def _places(self, couplings: Sequence[Coupling]) -> np.ndarray:
+        """Return where tools load the tissue at rest [m], shape (t, 3)."""
+        rest = self._model.mesh.rest
+        acting = [c.weights @ rest[c.nodes] for c in couplings if c.mode != FREE]
+        return np.array(acting).reshape(-1, 3)
 
     def _bent(self, u: np.ndarray, inverse_mass: np.ndarray) -> np.ndarray:
         """Return the squares of F - I at nodes that can move, 0 of a linear model, shape (n,)."""
@@ -355,18 +369,17 @@ class FarField:
             out[inverse_mass[::3] == 0.0] = 0.0
         return out
 
-    def _select(self, coupling: Coupling, bent: np.ndarray) -> None:
-        """Choose the nodes nearest to the tool, without a tool to its last place, and bent ones."""
+    def _select(self, couplings: Sequence[Coupling], bent: np.ndarray) -> None:
+        """Choose the nodes nearest to a tool, without tools to their last places, and bent ones."""
         model, n = self._model, self._model.mesh.node_count
-        rest = model.mesh.rest
-        if coupling.mode != FREE:
-            self._centre = coupling.weights @ rest[coupling.nodes]
+        places = self._places(couplings)
+        if len(places):
+            self._centres = places
         free = np.zeros(0, np.int64)
-        if len(self._centre):
+        if len(self._centres):
             rank = np.empty(n)
-            _rank(rest, self._centre, rank)
-            if coupling.mode != FREE:
-                rank[coupling.nodes] = -1.0
+            _rank(model.mesh.rest, self._centres, rank)
+            rank[held_nodes(couplings)] = -1.0
             most = min(self._nodes, n) - 1
             free = np.argpartition(rank, most)[: most + 1]
             self._radius = float(np.sqrt(max(rank[free].max(), 0.0)))

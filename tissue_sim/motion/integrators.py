@@ -4,7 +4,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from cutting_trainer.tissue_sim.contact.coupling import Spring
+from cutting_trainer.tissue_sim.contact.coupling import Springs
 from cutting_trainer.tissue_sim.contact.cut_contact import NO_CUT_CONTACTS, CutContacts
 from cutting_trainer.tissue_sim.elasticity.models import Operands
 from cutting_trainer.tissue_sim.motion.explicit import euler_steps, rk4_steps
@@ -36,7 +36,7 @@ class Integrator:
         operands: Operands,
         inverse_mass: np.ndarray,
         diagonal: np.ndarray,
-        spring: Spring,
+        springs: Springs,
         u: np.ndarray,
         v: np.ndarray,
         dt: float,
@@ -53,24 +53,24 @@ class Integrator:
             operands: of the model.
             inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
             diagonal: `ElasticModel.diagonal` [N/m], shape (3 n,).
-            spring: the tool's coupling.
+            springs: the couplings of the tools.
             u, v: displacement [m] and velocity [m/s], shape (3 n,).
             dt: step [s].
             steps: number of steps.
             spans: intervals of moving nodes, None: all, shape (s, 2).
             first: number of the first step in its frame.
-            total: steps of the frame, None: `steps`; the tool moves through all of them.
+            total: steps of the frame, None: `steps`; the tools move through all of them.
             faces: contacts of cut faces; `implicit` leaves them out.
 
         Returns:
-            Work of the spring on the tissue [J].
+            Work of the springs on the tissue [J].
         """
         if self._work.shape[1] < len(u):
             self._work = np.zeros((7, len(u)))
         if spans is None:
             spans = np.array([[0, len(u) // 3]])
         count = steps if total is None else total
-        head = (operands, spans, inverse_mass, self._damping, spring)
+        head = (operands, spans, inverse_mass, self._damping, springs)
         tail = (u, v, self._work, dt, first, steps, count)
         if self.name == 'implicit':
             return float(implicit_steps(*head, diagonal, self._tolerance, *tail))

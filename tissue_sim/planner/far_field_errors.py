@@ -51,7 +51,7 @@ class FarFieldTrial:
         moves = np.repeat(self._model.mass, 3) * self._free
         inverse = np.where(moves > 0.0, 1.0 / np.maximum(moves, 1e-300), 0.0)
         u, v = np.zeros((2, 3 * n + extra))
-        region = far.choose(u, v, np.zeros((n, 3)), inverse, coupling)
+        region = far.choose(u, v, np.zeros((n, 3)), inverse, [coupling])
         own = np.isin(np.arange(n), far.nodes).repeat(3) & self._free
         diagonal = far.diagonal(np.where(own, self._model.diagonal, 0.0))
         rim, axes = region.operands.coarse, np.arange(3)

@@ -1,32 +1,27 @@
-"""Simulation of the tissue frame by frame: loads, substeps, reaction on the tool, cut requests."""
+"""Simulation of the tissue frame by frame: loads, substeps, reaction on tools, cut requests."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.blade import NOT_TURNED, Blade, Resistance, Sweep
-from cutting_trainer.tissue_sim.contact.coupling import FREE, PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.coupling import Coupling, held_nodes
 from cutting_trainer.tissue_sim.contact.cut_contact import CUT_FRICTION
-from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction, GrippingSprings
+from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutCommand, Frame, ToolContact
-from cutting_trainer.tissue_sim.contact.tool_spring import ContactName, ToolSprings, footprint_force
+from cutting_trainer.tissue_sim.contact.tool_spring import ContactName
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
-from cutting_trainer.tissue_sim.mesh.locate import distance_to_triangles, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, Touched
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.divergence import MAX_TOOL_SPEED
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
-from cutting_trainer.tissue_sim.simulation.local_stiffness import (
-    ContactStiffness,
-    GrippingStiffness,
-)
-from cutting_trainer.tissue_sim.simulation.within_frame import Dent, ToolInFrame
+from cutting_trainer.tissue_sim.simulation.tool_state import ToolState
+from cutting_trainer.tissue_sim.simulation.within_frame import ToolInFrame
 
 
 class TissueSimulation:
-    """Integrates the tissue under the tool and requests cuts.
+    """Integrates the tissue under the tools and requests cuts.
 
     The same mesh, contacts and cuts, frame by frame, give the same numbers bit for bit.
 
@@ -42,6 +37,10 @@ class TissueSimulation:
         contact: how the load of a tool is spread, see `ToolSprings`.
         friction: of the tool on the surface.
         gravity: acceleration [m/s^2]; `Dynamics.settle` finds the shape at rest under it.
+        tools: how many there are.
+
+    Attributes:
+        tools: their states.
 
     Raises:
         ValueError: the integrator has no stable step with the material's damping.
@@ -60,28 +59,14 @@ class TissueSimulation:
         contact: ContactName = 'footprint',
         friction: Friction = NO_FRICTION,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        tools: int = 1,
     ) -> None:
         self.mesh = mesh
         self.material = material
         self.dynamics = Dynamics(mesh, material, model, stepping, active, gravity, CUT_FRICTION)
         self.step = 0
-        self.state = ContactState.NONE
         self.elements_cut = 0
-        self._resistance = resistance
-        self._frame_time = 1.0 / self.dynamics.stepping.rate
-        self._springs = ToolSprings(mesh, material.plane_modulus, contact)
-        told = ContactStiffness
-        if friction.sliding > 0.0:
-            self._springs = GrippingSprings(mesh, material.plane_modulus, contact, friction)
-            told = GrippingStiffness
-        self._stiffness = told(self.dynamics, self._springs)
-        self._pressed = 0.0
-        self._dent = Dent()
-        self._blade: Blade | None = None
-        self._target: np.ndarray | None = None
-        self._device: np.ndarray | None = None
-        self._edge: np.ndarray | None = None
-        self._moved = np.zeros(3)
+        self.tools = [ToolState(self.dynamics, resistance, contact, friction) for _ in range(tools)]
         self._outstanding: CutCommand | None = None
         self._finish_due = False
         if any(stretch):
@@ -108,9 +93,14 @@ class TissueSimulation:
         return self.dynamics.positions
 
     @property
+    def state(self) -> ContactState:
+        """State of the first tool's contact."""
+        return self.tools[0].state
+
+    @property
     def blade(self) -> Blade | None:
-        """The blade in the tissue; None: it is outside."""
-        return self._blade
+        """The blade in the tissue; None: none is."""
+        return next((tool.blade for tool in self.tools if tool.blade is not None), None)
 
     @property
     def awaits_answer(self) -> bool:
@@ -127,30 +117,64 @@ class TissueSimulation:
         self.dynamics.resume(displacement)
         self.step = step
 
-    def frame(self, contact: ToolContact | None) -> Frame:
+    def frame(self, *contacts: ToolContact | None) -> Frame:
         """Simulate one frame.
 
         Args:
-            contact: newest contact of the haptic bridge, or None.
+            contacts: newest contact of each tool, or None; missing ones are None.
 
         Returns:
-            The frame; with `command` set, an answer must follow (`CutTransaction`).
+            The frame as the first tool feels it, with those of the others. With `command` set, an
+            answer must follow (`CutTransaction`).
+
+        Raises:
+            ValueError: there are more contacts than tools.
         """
+        if len(contacts) > len(self.tools):
+            raise ValueError(f'{len(contacts)} contacts for {len(self.tools)} tools')
+        given = [*contacts, *[None] * (len(self.tools) - len(contacts))]
         self.step += 1
-        jump = self._jump(contact)
-        tool = self._tool(None if jump else contact)
-        coupling = Coupling() if tool is None else tool.coupling
-        motion = self.dynamics.advance(coupling, tool)
-        if tool is not None:
-            self._blade, coupling, self._dent = tool.blade, tool.coupling, tool.dent
-        elif contact is None or jump or contact.state != ContactState.TOUCHING:
-            self._dent = Dent()
-        pressed = self._push_of(coupling)
-        self._pressed = footprint_force(self._pressed, pressed)
-        self._springs.end_frame(coupling, self.displacement, pressed)
+        jumps = [tool.jump(contact) for tool, contact in zip(self.tools, given, strict=True)]
+        acting: list[ToolInFrame] = []
+        in_frame: list[ToolInFrame | None] = []
+        for tool, contact, jump in zip(self.tools, given, jumps, strict=True):
+            begun = tool.begin(None if jump else contact, lambda: self._may_enter(acting))
+            in_frame.append(begun)
+            if begun is not None:
+                acting.append(begun)
+        motion = self.dynamics.advance(*(tool.coupling for tool in acting), tools=acting)
+        couplings = [
+            tool.end(contact, begun, jumped=bool(jump))
+            for tool, contact, begun, jump in zip(self.tools, given, in_frame, jumps, strict=True)
+        ]
+        frames = [
+            self._frame_of(number, contact, motion, couplings, jump)
+            for number, (contact, jump) in enumerate(zip(given, jumps, strict=True))
+        ]
+        command, sweep = self._request()
+        return replace(frames[0], command=command, sweep=sweep, others=tuple(frames[1:]))
+
+    def _may_enter(self, acting: list[ToolInFrame]) -> bool:
+        """Return whether a blade may go in.
+
+        One at a time is in the tissue: a stroke of the cutting service has one blade. A second one
+        presses on the surface until the first is out.
+        """
+        return self.blade is None and all(tool.blade is None for tool in acting)
+
+    def _frame_of(
+        self,
+        number: int,
+        contact: ToolContact | None,
+        motion: FrameMotion,
+        couplings: list[Coupling],
+        jump: str,
+    ) -> Frame:
+        """Return the frame as a tool feels it."""
+        tool, coupling = self.tools[number], couplings[number]
         frame = Frame(
             step=self.step,
-            state=self.state,
+            state=tool.state,
             position=np.zeros(3) if contact is None else contact.device,
             force=np.zeros(3),
             stiffness=np.zeros((3, 3)),
@@ -162,151 +186,39 @@ class TissueSimulation:
             diverged=motion.diverged,
             trouble=jump or motion.trouble,
             strain=motion.strain,
+            tool=number,
         )
         if motion.diverged or jump:
-            self._release_blade()
-            return replace(frame, state=self.state, command=self._next_finish())
-        command, sweep = self._decide(contact, coupling)
-        force = self._reaction(coupling, motion)
-        outside = contact if self._blade is None else None
+            self._finish_due |= tool.release()
+            return replace(frame, state=tool.state)
+        self._finish_due |= tool.update(contact, coupling)
+        others = held_nodes(couplings[:number] + couplings[number + 1 :])
+        alone = not np.isin(others, coupling.nodes).any()
+        force = tool.reaction(motion, coupling, alone=alone)
+        blade = tool.blade
         return replace(
             frame,
-            state=self.state,
+            state=tool.state,
             force=force,
-            stiffness=self._stiffness.matrix(coupling, outside, self._moved, force),
-            resistance=self._blade.limit if self._blade else 0.0,
-            turning=self._blade.turning if self._blade else NOT_TURNED,
-            command=command,
-            sweep=sweep,
+            stiffness=tool.stiffness(contact, coupling, force),
+            resistance=tool.transmits,
+            turning=blade.turning if blade else NOT_TURNED,
         )
 
-    def _jump(self, contact: ToolContact | None) -> str:
-        """Return why a contact is implausible, or ''."""
-        before = self._device
-        self._device = None if contact is None else contact.device.copy()
-        self._moved = np.zeros(3)
-        if before is None or contact is None:
-            return ''
-        self._moved = contact.device - before
-        speed = float(np.linalg.norm(self._moved)) / self._frame_time
-        if speed <= MAX_TOOL_SPEED:
-            return ''
-        return (
-            f'the tool has moved by {1e3 * speed * self._frame_time:.3g} mm within a frame: '
-            f'{speed:.3g} m/s are above the {MAX_TOOL_SPEED:g} m/s of a hand'
-        )
-
-    def _tool(self, contact: ToolContact | None) -> ToolInFrame | None:
-        """Return the tool of this frame; None: nothing acts on the tissue."""
-        edge, self._edge = self._edge, None
-        if contact is None:
-            self._target = None
-            if self._blade is not None:
-                self._blade.let_go()
-            return None
-        self._edge = np.array([contact.blade_root, contact.blade_tip])
-        positions, pushing = self.positions, Coupling()
-        if self._blade is not None:
-            edge = self._blade.device
-        elif contact.state == ContactState.TOUCHING and contact.topology == self.mesh.topology:
-            pushing = self._pushed_by(contact, positions)
-            self._target = contact.device - contact.offset
-        else:
-            self._target = None
-            return None
-        return ToolInFrame(
-            self.mesh,
-            self._resistance,
-            contact,
-            self._edge if edge is None else edge,
-            pushing,
-            self._blade,
-            positions,
-            self._frame_time,
-            self.material.line_compliance,
-            self._dent if pushing.mode == PUSH else Dent(),
-        )
-
-    def _pushed_by(self, contact: ToolContact, positions: np.ndarray) -> Coupling:
-        """Return the spring of a contact.
-
-        Along the surface it starts relaxed: the tissue sticks to the tool within a frame and slips
-        between frames, unless there is friction (`GrippingSprings.drag`).
-        """
-        end, n = contact.device - contact.offset, contact.normal
-        start = self._target
-        if start is None:
-            start = contact.weights @ positions[contact.nodes]
-        coupling = self._springs.spring(contact, self._pressed, float((start - end) @ n))
-        point = coupling.point(positions)
-        start = point if self._target is None else start + (coupling.end - end)
-        coupling.start = point + n * float((start - point) @ n)
-        coupling.end = point + n * float((coupling.end - point) @ n)
-        self._springs.drag(coupling, contact, point)
-        return coupling
-
-    def _push_of(self, coupling: Coupling) -> float:
-        """Return the normal force of the tool on the surface [N]."""
-        if coupling.mode != PUSH:
-            return 0.0
-        return max(-float(coupling.force(self.positions) @ coupling.normal), 0.0)
-
-    def _decide(
-        self, contact: ToolContact | None, coupling: Coupling
-    ) -> tuple[CutCommand | None, Sweep | None]:
-        if self._blade is None:
-            self.state = ContactState.TOUCHING if coupling.mode == PUSH else ContactState.NONE
-            return self._next_finish(), None
-        self.state = ContactState.INSIDE
-        if contact is not None and (contact.state == ContactState.NONE or self._clear(contact)):
-            self._release_blade()
-            return self._next_finish(), None
-        finish = self._next_finish()  # of the stroke before
-        sweep = self._blade.sweep()
-        if self._outstanding is not None or sweep is None:
-            return finish, None
-        self._blade.confirm_sweep()
+    def _request(self) -> tuple[CutCommand | None, Sweep | None]:
+        """Return what the cutting service is asked for; a stroke ends before the next begins."""
+        if self._outstanding is not None:
+            return None, None
+        if self._finish_due:
+            self._finish_due, self._outstanding = False, CutCommand.FINISH
+            return CutCommand.FINISH, None
+        blade = self.blade
+        sweep = None if blade is None else blade.sweep()
+        if blade is None or sweep is None:
+            return None, None
+        blade.confirm_sweep()
         self._outstanding = CutCommand.ADVANCE
         return CutCommand.ADVANCE, sweep
-
-    def _next_finish(self) -> CutCommand | None:
-        """Return FINISH until it is answered, once no other answer is pending."""
-        if not self._finish_due or self._outstanding is not None:
-            return None
-        self._finish_due = False
-        self._outstanding = CutCommand.FINISH
-        return CutCommand.FINISH
-
-    def _release_blade(self) -> None:
-        self._finish_due |= self._blade is not None
-        self._blade = None
-        self._target = None
-        self.state = ContactState.NONE
-
-    def _clear(self, contact: ToolContact) -> bool:
-        """Return whether the blade has left and the tip's sphere touches nothing, so that no force
-        jumps.
-        """
-        if self._blade is None or self._blade.immersed > 0.0:
-            return False
-        positions, mesh = self.positions, self.mesh
-        if distance_to_triangles(contact.device, positions, mesh.triangles) <= contact.radius:
-            return False
-        tip = contact.device[None]
-        found, _ = find_tetrahedra(positions, mesh.tetrahedra, mesh.neighbors, tip)
-        return bool(found[0] < 0)
-
-    def _reaction(self, coupling: Coupling, motion: FrameMotion) -> np.ndarray:
-        """Return the force of the tissue on the tool [N], shape (3,)."""
-        if self._blade is not None:
-            return -self._blade.force
-        if coupling.mode == FREE:
-            return np.zeros(3)
-        internal = motion.elastic_force[coupling.nodes]
-        if self.material.beta:
-            viscous = self.model.product(self.velocity, coupling.nodes)
-            internal = internal + self.material.beta * viscous
-        return np.asarray(-internal.sum(axis=0))
 
     def apply_cut(self, delta: TopologyDelta) -> Touched:
         """Apply a change of connectivity; displacement and velocity are interpolated.
@@ -323,7 +235,8 @@ class TissueSimulation:
         """
         count = self.mesh.node_count
         touched = self.dynamics.apply_cut(delta)
-        self._springs.apply_cut(count, delta, touched)
+        for tool in self.tools:
+            tool.apply_cut(count, delta, touched)
         self._outstanding = None
         self.elements_cut += len(delta.removed_tetrahedra)
         return touched
@@ -337,5 +250,5 @@ class TissueSimulation:
         failed, self._outstanding = self._outstanding, None
         if failed == CutCommand.FINISH:
             self._finish_due = True
-        elif failed == CutCommand.ADVANCE and self._blade is not None:
-            self._blade.retry_sweep()
+        elif failed == CutCommand.ADVANCE and self.blade is not None:
+            self.blade.retry_sweep()

@@ -50,7 +50,7 @@ from cutting_trainer.tissue_sim.motion import (
 )
 from cutting_trainer.tissue_sim.motion import divergence as guard
 from cutting_trainer.tissue_sim.simulation import local_stiffness as contact_stiffness
-from cutting_trainer.tissue_sim.simulation import simulation, within_frame
+from cutting_trainer.tissue_sim.simulation import simulation, tool_state, within_frame
 from cutting_trainer.tissue_sim.simulation.serialisation import (
     ObjectState,
     capture,
@@ -96,6 +96,7 @@ _MODULES = (
     stiffened_mass,
     tensor_mass,
     tool_spring,
+    tool_state,
     topology,
     viscosity,
     within_frame,

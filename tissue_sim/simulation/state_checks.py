@@ -20,8 +20,10 @@ from cutting_trainer.tissue_sim.elasticity.rotation import LANES
 from cutting_trainer.tissue_sim.elasticity.viscosity import KEPT as KEPT_OF_TERM
 from cutting_trainer.tissue_sim.elasticity.viscosity import ViscousNodes
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.simulation.serialisation import StateError
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+from cutting_trainer.tissue_sim.simulation.tool_state import ToolState
 
 
 def checked(check: Callable[[Any], None], made: object) -> None:
@@ -147,16 +149,19 @@ def check_simulation(simulation: TissueSimulation) -> None:
         has_room('_linear', dynamics._stiffened._linear, n)
     regions = len(model.material.relative_stiffness)
     within('region', mesh.regions, regions)
-    if simulation._blade is not None and len(simulation._resistance.regions) + 1 < regions:
-        raise StateError('regions of the tissue have no resistance to the blade')
+    for tool in simulation.tools:
+        if tool.blade is not None and len(tool._resistance.regions) + 1 < regions:
+            raise StateError('regions of the tissue have no resistance to the blade')
     _check_model(model, n)
     _check_estimates(simulation, n)
     if dynamics._far is None:
         _check_region(dynamics._active, n)
     else:
         _check_far_field(dynamics, n)
-    has_room('tip of the dent', simulation._dent.tip, 3)
-    _check_blade(simulation, n)
+    if not simulation.tools:
+        raise StateError('it has no tool')
+    for tool in simulation.tools:
+        _check_tool(tool, dynamics, n)
 
 
 def _check_loads(dynamics: Any, n: int) -> None:
@@ -281,19 +286,6 @@ def _check_estimates(simulation: TissueSimulation, n: int) -> None:
     within('_patch', bound._patch, n if bound._done else 1 << 31)
     for cut in bound._cut:
         within('_cut', cut, 1 << 31)
-    stiffness: Any = simulation._stiffness
-    for point in (stiffness._here, stiffness._ahead, getattr(stiffness, '_beside', None)):
-        if point is None:
-            continue
-        if point._topology == simulation.mesh.topology:
-            within('_patch', point._patch, n)
-            has_room('_x', point._x, 0, 3 * n)
-            has_room('_held', point._held, 5, 3 * n)
-    footprints: Any = simulation._springs._footprints
-    if footprints is not None:
-        has_room('_sizes', footprints._sizes, n, 1)
-    if isinstance(simulation._springs, GrippingSprings):
-        has_room('_stretch', simulation._springs._stretch, 3)
     work: Any = dynamics._integrator._work
     has_room('_work', work, 7, *work.shape[1:])
     has_room('_damping', dynamics._integrator._damping, 2)
@@ -387,15 +379,40 @@ def _check_operands(operands: Operands, size: int) -> None:
         has_room('local blocks', local.blocks, 9 * slots + 1)
 
 
-def _check_blade(simulation: TissueSimulation, n: int) -> None:
-    """Check the blade's coupling, and that points have three coordinates."""
+def _check_tool(tool: ToolState, dynamics: Dynamics, n: int) -> None:
+    """Check a tool's springs, and that points have three coordinates."""
+    stiffness: Any = tool._stiffness
+    springs: Any = tool._springs
+    if tool._dynamics is not dynamics or stiffness._dynamics is not dynamics:
+        raise StateError('a tool is in another tissue')
+    if stiffness._springs is not springs:
+        raise StateError('the stiffness is that of other springs')
+    for point in (stiffness._here, stiffness._ahead, getattr(stiffness, '_beside', None)):
+        if point is None:
+            continue
+        if point._topology == dynamics.mesh.topology:
+            within('_patch', point._patch, n)
+            has_room('_x', point._x, 0, 3 * n)
+            has_room('_held', point._held, 5, 3 * n)
+    if springs._footprints is not None:
+        has_room('_sizes', springs._footprints._sizes, n, 1)
+    if isinstance(springs, GrippingSprings):
+        has_room('_stretch', springs._stretch, 3)
+    has_room('tip of the dent', tool._dent.tip, 3)
     for name in ('_target', '_device', '_moved'):
-        point = getattr(simulation, name)
-        if point is not None:
-            has_room(name, point, 3)
-    blade: Any = simulation._blade
-    if blade is None:
-        return
+        place = getattr(tool, name)
+        if place is not None:
+            has_room(name, place, 3)
+    if (grip := tool._grip) is not None:
+        within('nodes of the grip', grip.nodes, n)
+        has_room('weights of the grip', grip.weights, len(grip.nodes))
+        has_room('offset of the grip', grip.offset, 3)
+        has_room('end of the grip', grip.end, 3)
+    if tool.blade is not None:
+        _check_blade(tool.blade, n)
+
+
+def _check_blade(blade: Any, n: int) -> None:
     edge, strips = blade._state, blade._strips
     for name, width in (('points', 3), ('corners', 4), ('weights', 4)):
         has_room(f'{name} of the edge', getattr(edge, name), POINTS, width)

@@ -4,6 +4,7 @@ At 30 Hz a hand moves the blade by millimetres in a frame. Evaluated once, the b
 late, cut late, and hold on to tissue that it has left.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -69,6 +70,7 @@ class ToolInFrame:
         frame_time: [s].
         line_compliance: of the tissue, see `Material.line_compliance` [m^2/N].
         dent: of the tool on the surface at the begin of the frame.
+        may_enter: whether the blade may go in now.
 
     Attributes:
         dent: at present.
@@ -89,7 +91,9 @@ class ToolInFrame:
         frame_time: float,
         line_compliance: float,
         dent: Dent,
+        may_enter: Callable[[], bool],
     ) -> None:
+        self._may_enter = may_enter
         self._mesh, self._resistance, self._contact = mesh, resistance, contact
         self._way = before, np.array([contact.blade_root, contact.blade_tip])
         self._pushing = pushing
@@ -137,7 +141,7 @@ class ToolInFrame:
         if self._resistance.tip_width > 0.0:
             tip, stiffness = self._device(share)[1], self._contact.stiffness
             self.dent = self.dent.deepened(pressed, tip, spring.normal, stiffness)
-        if self._contact.mode == ToolMode.PALPATOR:
+        if self._contact.mode != ToolMode.SCALPEL or not self._may_enter():
             return False
         at_tip = self._toughness() * self._resistance.tip_width
         if at_tip == 0.0:
