@@ -33,7 +33,7 @@ from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.node_common.rejections import MessageError, RejectionStatistics
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
-from cutting_trainer.tissue_sim.contact.tool import ToolMode
+from cutting_trainer.tissue_sim.contact.tool import MAX_PULL_N, ToolMode
 
 _SECOND = 1e-9
 _QUEUE_ALLOWANCE_NS = 3_000_000
@@ -70,7 +70,7 @@ class ForcePath:
         contact_time: total [s].
         max_force: largest norm commanded [N].
         mode: of the tool, as it is reported.
-        next_mode: mode that it takes once it is outside of the tissue.
+        next_mode: mode that it takes once no blade is in the tissue.
 
     Raises:
         SettingsError: the settings do not fit together.
@@ -225,7 +225,7 @@ class ForcePath:
         self._was_enabled = enabled
         gain = self._gain(now_ns, enabled)
         touched = self._touch(now_ns, surface, enabled)
-        if self._contact != INSIDE:
+        if self._contact != INSIDE or self.mode.is_grasper:
             self.mode = self.next_mode
         if fault or state is CrtkState.FAULT:
             self._s['force'] = self._s['torque'] = 0.0
@@ -295,7 +295,8 @@ class ForcePath:
         self._step, self._sample_revision = reaction.step, reaction.revision
         self._sample_ns = sample_ns - _QUEUE_ALLOWANCE_NS
         self._sample_state = reaction.state
-        self._s['resistance'] = min(reaction.resistance, self._max_resistance)
+        most = MAX_PULL_N if self.mode.is_grasper else self._max_resistance
+        self._s['resistance'] = min(reaction.resistance, most)
         self._s['torque_resistance'] = min(
             reaction.torque_resistance, self._max_resistance * self._length
         )
@@ -376,7 +377,8 @@ class ForcePath:
                 self._s['held'] = before_cut + self._setup['slack'][0]
             self._contact = INSIDE
             assert surface is not None
-            self._s['reach'] = self._plausibility.reach(surface, self._blade)
+            reach = 1.0 if self.mode.is_grasper else self._plausibility.reach(surface, self._blade)
+            self._s['reach'] = reach
             self._s['proxy'] = self._tip
             return None
         if before == INSIDE or (before == TOUCHING and not enabled):

@@ -1,4 +1,4 @@
-"""A button of the device that makes a palpator of the scalpel, and back."""
+"""A button of the device that changes the mode of the tool, and back."""
 
 from collections.abc import Callable
 

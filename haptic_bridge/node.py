@@ -75,8 +75,8 @@ class HapticBridge(ManagedNode):
             Never again after that: a FAULT is left by a command only. Never after an E-STOP.
         e_stop_pressed: E-STOP is pressed from the start, as it was when this node died.
         force_scale: hand force over tissue force; may be set while the node runs.
-        tool_mode: scalpel or palpator; may be set while the node runs. A blade in the tissue stays
-            one until it is out.
+        tool_mode: one of `MODES`; may be set while the node runs. A blade in the tissue stays one
+            until it is out.
         accepted_publishers: see `accepted_publishers`.
     """
 
@@ -134,7 +134,7 @@ class HapticBridge(ManagedNode):
         self._wiring, self._wiring_due = Wiring(self, self._wrench, understood), 0.0
         text = 'hand force over tissue force [-], above 0 to 100'
         parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
-        text = f'what the tool is: {" or ".join(MODES)}; used once it is outside of the tissue'
+        text = f'what the tool is: {" or ".join(MODES)}; used once no blade is in the tissue'
         mode = parameter(self, 'tool_mode', tool.mode, text, settable=True)
         self._path.next_mode = mode_of(mode)
         self._mode_button = None
@@ -232,8 +232,8 @@ class HapticBridge(ManagedNode):
                 self._path.next_mode = mode_of(given.value)
 
     def _change_mode(self) -> None:
-        """Make a palpator of the scalpel, and back."""
-        mode = ToolMode(1 - self._path.next_mode).name.lower()
+        """Make a palpator of the scalpel, or close the jaws of a grasper, and back."""
+        mode = self._path.next_mode.other.name.lower()
         self.set_parameters([Parameter('tool_mode', value=mode)])
 
     def _cause(self) -> str:

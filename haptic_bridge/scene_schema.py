@@ -43,10 +43,11 @@ class ToolSettings(SceneModel):
         description='direction across the blade in which its edge cuts, tool frame; spine and '
         'flat carry the tissue along, uncut. [0, 0, 0]: it cuts all round',
     )
-    mode: Literal['scalpel', 'palpator'] = Field(
+    mode: Literal['scalpel', 'palpator', 'open_grasper', 'closed_grasper'] = Field(
         'scalpel',
-        description='what the tool is at first; a palpator never goes in. The parameter '
-        '`tool_mode` of haptic_bridge, or `device.mode_button`, changes it',
+        description='what the tool is at first: a palpator never goes in, a closed grasper holds '
+        'the tissue that it has closed on. The parameter `tool_mode` of haptic_bridge, or '
+        '`device.mode_button`, changes it',
     )
 
     @model_validator(mode='after')
@@ -127,7 +128,7 @@ class DeviceSettings(SceneModel):
         ge=0,
         le=31,
         description='index into buttons of arm/button that makes a palpator of the scalpel, or '
-        'back',
+        'closes the jaws of a grasper, or back',
     )
     accepted_publishers: tuple[str, ...] = Field(
         (),

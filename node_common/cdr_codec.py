@@ -26,7 +26,7 @@ _FRAME_CACHE_SIZE = 64
 """Decoded frame_ids that are kept."""
 NORM_TOLERANCE = 0.01
 """Largest difference between the norm of a unit quaternion and 1."""
-_LAST = {'state': 2, 'mode': 1}
+_LAST = {'state': 2, 'mode': 3}
 """Largest number of a field that chooses."""
 MAX_QUANTITY = 1e6
 """Bound on every physical quantity: a position in millimetres, a stiffness in N/m."""

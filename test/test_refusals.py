@@ -111,7 +111,7 @@ def test_a_contact_of_before_a_cut_that_took_nodes_away_is_none_of_its_nodes() -
     [
         ({'state': 3}, 'no such state'),
         ({'tool': 1}, 'no such tool'),
-        ({'mode': 2}, 'no such mode of the tool'),
+        ({'mode': 4}, 'no such mode of the tool'),
         ({'blade_facing': np.array([0.6, 0.0, 0.6])}, 'no unit vector'),
         ({'nodes': np.full(9, 2**32 - 1, np.uint32)}, 'index out of range'),
         ({'weights': np.full(9, 0.5)}, 'invalid weights'),
@@ -225,7 +225,7 @@ def test_an_orientation_or_a_state_that_does_not_exist_is_not_believed() -> None
 
 def test_a_mode_of_the_tool_that_does_not_exist_is_not_believed() -> None:
     values = [0] * ContactCodec.fields['mode'].stop
-    values[-1] = 2
+    values[-1] = 4
     with pytest.raises(MessageError, match='no such mode'):
         ContactCodec().believed(ContactCodec().encode(5, values))
 

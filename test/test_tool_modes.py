@@ -1,4 +1,4 @@
-"""Scalpel and palpator: by the scene, while the session runs, and computed again as it was."""
+"""Modes of the tool: by the scene, while the session runs, and computed again as they were."""
 
 from pathlib import Path
 
@@ -51,6 +51,34 @@ def test_the_mode_is_that_of_the_scene_and_changes_outside_of_the_tissue_only() 
     rig.inside = False
     rig.run(np.full(70, 0.02))
     assert rig.ticks[-1].contact[MODE] == rig.path.mode == PALPATOR
+
+
+def test_a_grasper_lifts_the_tissue_and_the_hand_feels_its_pull_until_the_jaws_open() -> None:
+    session = simulate('block')
+    session.path.next_mode = ToolMode.OPEN_GRASPER
+    down = np.linspace(-0.010, -0.019, 400)
+
+    def at(z: float) -> np.ndarray:
+        return np.array([-0.012, -0.008, z])
+
+    for z in down:
+        session.tick(at(z))
+    session.wait(0.3, at(down[-1]))
+    session.path.next_mode = ToolMode.CLOSED_GRASPER
+    top = float(session.tissue.simulation.positions[:, 2].max())
+    felt = []
+    for z in np.linspace(down[-1], -0.008, 1200):
+        felt.append(session.tick(at(z)).wrench[2])
+    session.wait(0.3, at(-0.008))
+    last = session.tick(at(-0.008)).wrench[2]
+    assert session.frame is not None
+    assert last == pytest.approx(session.frame.force[2], rel=0.05)
+    assert last < -0.05, 'the tissue pulls the hand down'
+    assert max(np.abs(np.diff(felt))) < 0.02, 'no jump where the jaws close'
+    assert session.tissue.simulation.positions[:, 2].max() > top + 2e-3
+    session.path.next_mode = ToolMode.OPEN_GRASPER
+    session.wait(0.3, at(-0.008))
+    assert session.tick(at(-0.008)).wrench[2] >= 0.0
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.in_process import Tissue
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import (
+    MAX_PULL_N,
     ContactState,
     Frame,
     ToolContact,
@@ -23,7 +24,6 @@ from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.simulation.state import from_state, state_of
-from cutting_trainer.tissue_sim.simulation.tool_state import MAX_PULL_N
 
 pytestmark = pytest.mark.long
 
@@ -182,7 +182,7 @@ def test_a_grasper_lifts_what_it_has_closed_on_and_lets_go() -> None:
 
 def test_tissue_that_is_pulled_too_hard_slips_out_of_the_jaws() -> None:
     simulation = block(modulus=50_000.0)
-    over = at_node(simulation, 0.03, 0.015, TOP - 1e-3)
+    over = replace(at_node(simulation, 0.03, 0.015, TOP - 1e-3), radius=0.01)
     simulation.frame(grasper(over, closed=False))
     pulls = []
     for k in range(120):

@@ -35,7 +35,7 @@ from cutting_trainer.node_common.timing import (
 )
 from cutting_trainer.tissue_sim.assembly import as_planned, make_simulation
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
-from cutting_trainer.tissue_sim.contact.tool import ContactState, Frame, ToolContact
+from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.planner.monitor import PlanMonitor
@@ -235,7 +235,7 @@ class TissueSimNode(ManagedNode):
         """Publish the pieces that came off, once the blade has left the tissue."""
         simulation = self._simulation
         mesh = simulation.mesh
-        if frame.state == ContactState.INSIDE or mesh.topology == self._looked_at:
+        if simulation.blade is not None or mesh.topology == self._looked_at:
             return
         self._looked_at = mesh.topology
         for piece in self._pieces.find_new(mesh, simulation.positions):

@@ -9,6 +9,10 @@ from cutting_trainer.tissue_sim.contact.blade import NOT_TURNED, Sweep, Turning
 from cutting_trainer.tissue_sim.mesh.strain import Strain
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
+MAX_PULL_N = 5.0
+"""[N] at which tissue slips out of the jaws of a grasper."""
+MAX_STRETCH_RADII = 2.0
+"""Radii of the tool between jaws and tissue at which it slips, too."""
 MIN_RADIUS_M = 1e-5
 """[m] Least radius of a tool: a point would have no footprint and an infinite pressure."""
 
@@ -24,13 +28,23 @@ class ContactState(enum.IntEnum):
 class ToolMode(enum.IntEnum):
     """Kind of a tool; numbers as in `Contact`.
 
-    A palpator never goes in. A grasper holds what its jaws close on, until they open.
+    A palpator never goes in. A grasper holds the tissue that its jaws close on, until they open.
     """
 
     SCALPEL = 0
     PALPATOR = 1
     OPEN_GRASPER = 2
     CLOSED_GRASPER = 3
+
+    @property
+    def is_grasper(self) -> bool:
+        """Whether it has jaws."""
+        return self in (ToolMode.OPEN_GRASPER, ToolMode.CLOSED_GRASPER)
+
+    @property
+    def other(self) -> 'ToolMode':
+        """The mode that a press of the mode button changes to."""
+        return ToolMode(self ^ 1)
 
 
 class CutCommand(enum.IntEnum):

@@ -8,7 +8,13 @@ import numpy as np
 from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance
 from cutting_trainer.tissue_sim.contact.coupling import FREE, HOLD, PUSH, Coupling
 from cutting_trainer.tissue_sim.contact.friction import Friction, GrippingSprings
-from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact, ToolMode
+from cutting_trainer.tissue_sim.contact.tool import (
+    MAX_PULL_N,
+    MAX_STRETCH_RADII,
+    ContactState,
+    ToolContact,
+    ToolMode,
+)
 from cutting_trainer.tissue_sim.contact.tool_spring import (
     ContactName,
     ToolSprings,
@@ -25,12 +31,9 @@ from cutting_trainer.tissue_sim.simulation.local_stiffness import (
 )
 from cutting_trainer.tissue_sim.simulation.within_frame import Dent, ToolInFrame
 
-MAX_PULL_N = 5.0
-"""[N] at which tissue slips out of the jaws."""
-
 
 class Grip(NamedTuple):
-    """What a grasper has closed on.
+    """Tissue between the jaws of a grasper.
 
     Attributes:
         nodes, weights: of the tissue between the jaws, shape (c,).
@@ -147,7 +150,7 @@ class ToolState:
     def end(
         self, contact: ToolContact | None, tool: ToolInFrame | None, *, jumped: bool
     ) -> Coupling:
-        """Take over what a frame has done to the tool; return its spring at the end of it.
+        """Take over the result of a frame; return the spring of the tool at its end.
 
         Args:
             contact: at the end of the frame.
@@ -261,13 +264,13 @@ class ToolState:
         grip = self._grip
         if grip is not None:
             pulled = np.linalg.norm(grip.end - grip.weights @ positions[grip.nodes])
-            slips = contact.stiffness * float(pulled) >= MAX_PULL_N
-            if slips or contact.mode != ToolMode.CLOSED_GRASPER:
+            most = min(MAX_PULL_N / contact.stiffness, MAX_STRETCH_RADII * contact.radius)
+            if pulled >= most or contact.mode != ToolMode.CLOSED_GRASPER:
                 self._grip = None
         return self._grip is not None
 
     def _close(self, contact: ToolContact, spring: Coupling) -> None:
-        """Grasp what the closed jaws touch; nothing jumps, since the spring keeps its force."""
+        """Grasp the tissue that the closed jaws touch; the spring keeps its force."""
         if contact.mode == ToolMode.CLOSED_GRASPER and spring.mode == PUSH:
             positions = self._dynamics.positions
             point = spring.point(positions)
