@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from meshes import box
 
-from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
+from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep, points_of
+from cutting_trainer.tissue_sim.contact.immersion import (
+    POINTS,
+    Edge,
+    Tissue,
+    immerse,
+    rest_length,
+)
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutCommand, Frame, ToolContact
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.locate import barycentric, find_tetrahedra
@@ -182,6 +189,31 @@ def test_blade_that_goes_back_in_its_cut_pays_nothing_until_it_is_at_the_front_a
     # 0.08 mm a frame; the tissue and the spring relax over the first 7 of the 12 mm.
     assert 2 * 4.5e-3 < len(free) * 8e-5 < 2 * 7e-3
     assert np.median(forces[-30:]) == pytest.approx(TOUGHNESS * 0.01, rel=0.1)
+
+
+def test_the_length_at_rest_counts_tissue_as_it_was_and_no_gap_between_two_pieces() -> None:
+    nodes, tets = box((2, 2, 2), 0.005)
+    apart = nodes + np.array([0.0, 0.0, 0.02])
+    mesh = TetMesh(np.concatenate([nodes, apart]), np.concatenate([tets, tets + len(nodes)]))
+    positions = mesh.rest * np.array([1.0, 1.0, 0.8])
+    positions[len(nodes) :, 2] += 0.01
+    tip = np.array([0.0041, 0.0052, -0.001])
+    points = points_of(tip + np.array([[0.0, 0.0, 0.05], [0.0, 0.0, 0.0]]))
+    edge = Edge(
+        points.copy(),
+        np.zeros((POINTS, 4), np.int64),
+        np.zeros((POINTS, 4)),
+        np.zeros(POINTS),
+        np.zeros(1, np.int64),
+        np.zeros(POINTS, np.int64),
+    )
+    near, opened = np.arange(len(mesh.tetrahedra)), np.zeros((0, 3), np.int32)
+    of = mesh.tetrahedra, mesh.neighbors, near, opened, mesh.regions
+    tissue = Tissue(positions, mesh.rest, *of)
+    immerse(edge, points, tissue)
+    inside = edge.spans > 0.0
+    assert inside.any() and not inside[np.flatnonzero(inside)[0] : np.flatnonzero(inside)[-1]].all()
+    assert rest_length(edge, tissue) == pytest.approx(1 / 0.8, rel=1e-9)
 
 
 def test_below_the_threshold_the_blade_does_not_go_in() -> None:

@@ -48,8 +48,9 @@ def test_a_short_slice_lags_by_its_springs_alone_and_lets_go_when_it_is_withdraw
         frame = cutter.frame(contact_at(simulation, tip))
         if simulation.blade is not None:
             lags.append(simulation.blade.lag)
-            # Each spring yields at the toughness of its piece; all of them are twice the coupling.
-            assert lags[-1] <= TOUGHNESS * EDGE / (2 * COUPLING) + 1e-5
+            # Each spring yields at the toughness of its piece, up to a tenth longer at rest; all of
+            # them are twice the coupling.
+            assert lags[-1] <= 1.1 * TOUGHNESS * EDGE / (2 * COUPLING)
         if tip[2] > TOP + 0.005:
             assert not frame.force.any()
     assert max(lags) > 5e-4

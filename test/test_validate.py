@@ -51,11 +51,12 @@ def test_the_steady_force_of_a_blade_is_toughness_times_its_depth(cell: float) -
     assert found.force[0] == pytest.approx(187.0 * found.depth, rel=0.07)
 
 
-def test_a_blade_that_slices_feels_the_force_of_atkins() -> None:
-    found = drawn('stiffening', 76.0, FIRM, 0.0053, 1.5)
-    across = 76.0 * found.depth / (1 + 1.5**2)
+@pytest.mark.parametrize(('toughness', 'ratio'), [(76.0, 1.5), (120.0, 0.5)])
+def test_a_blade_that_slices_feels_the_force_of_atkins(toughness: float, ratio: float) -> None:
+    found = drawn('stiffening', toughness, FIRM, 0.0044, ratio)
+    across = toughness * found.depth / (1 + ratio**2)
     assert found.force[0] == pytest.approx(across, rel=0.1)
-    assert -found.force[2] == pytest.approx(1.5 * across, rel=0.1)
+    assert -found.force[2] == pytest.approx(ratio * across, rel=0.1)
 
 
 def test_a_result_without_a_value_is_outside_and_its_reason_is_in_the_table() -> None:

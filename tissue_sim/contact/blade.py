@@ -217,7 +217,9 @@ class Blade:
         margin += float(np.linalg.norm(points[1] - points[0]))
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
         among = near.find(positions, low, high)
-        tissue = Tissue(positions, mesh.tetrahedra, mesh.neighbors, among, opened, mesh.regions)
+        tissue = Tissue(
+            positions, mesh.rest, mesh.tetrahedra, mesh.neighbors, among, opened, mesh.regions
+        )
         pull = follow_device(self._state, self._strips, points, self._moved, tissue, self._law)
         self._settle(pull)
 

@@ -8,6 +8,7 @@ from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.contact.facing import (
     TINY,
     Held,
+    Law,
     across,
     dot,
     hold,
@@ -27,6 +28,7 @@ from cutting_trainer.tissue_sim.contact.immersion import (
     SHARES,
     immerse,
     lag_behind,
+    rest_length,
 )
 
 WHOLE = POINTS / 2
@@ -96,6 +98,7 @@ def follow_device(edge, strips, device, moved, tissue, law):
     if not edge.spans.any():
         strips.counts[:] = 0
         return no_pull()
+    law = _law_now(law, rest_length(edge, tissue))
     low, high = _box(edge, device)
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
     fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
@@ -207,6 +210,13 @@ def gather_loads(edge, loads):
                 nodes[at], shares[at], count = node, 0.0, count + 1
             shares[at] += loads[i] * edge.weights[i, k]
     return nodes[:count].copy(), shares[:count].copy()
+
+
+@inner
+def _law_now(law, longer):
+    """Return the law with toughness by area now, where the edge is longer at rest by a factor."""
+    toughness = longer * law.toughness
+    return Law(law.stiffness, toughness, law.friction, law.facing, law.compliance, law.at_tip)
 
 
 @inner

@@ -44,7 +44,7 @@ class Tissue(NamedTuple):
     """The tissue as operand of the kernels.
 
     Attributes:
-        positions: nodes now [m], shape (n, 3).
+        positions, rest: nodes now and at rest [m], shape (n, 3).
         tetrahedra, neighbors: of the mesh, shape (m, 4).
         near: tetrahedra among which points are looked for, shape (k,).
         opened: triangles of the surface that cuts have opened, shape (c, 3).
@@ -52,6 +52,7 @@ class Tissue(NamedTuple):
     """
 
     positions: np.ndarray
+    rest: np.ndarray
     tetrahedra: np.ndarray
     neighbors: np.ndarray
     near: np.ndarray
@@ -89,6 +90,40 @@ def immerse(edge, device, tissue):
         _enter(edge, i, tissue, found[i])
     _measure_spans(edge, device, tissue)
     _relax(edge, device, tissue, before)
+
+
+@inner
+def rest_length(edge, tissue):
+    """Return the length at rest over that now, of the part of the edge in the tissue.
+
+    Toughness is work by area at rest: tissue that the blade compresses along its edge is cut in
+    full. Each run of points in the tissue counts from its first to its last, so that neither a
+    crushed element nor a gap between two runs tells. A point on its own knows no stretch.
+
+    Args:
+        edge: `Edge`, of which a part is in the tissue.
+        tissue: `Tissue`.
+    """
+    rest = now = 0.0
+    first = 0
+    for i in range(POINTS):
+        if edge.spans[i] == 0.0:
+            first = i + 1
+            continue
+        if i + 1 < POINTS and edge.spans[i + 1] > 0.0:
+            continue
+        length = edge.spans[first : i + 1].sum()
+        at_rest = apart = 0.0
+        for c in range(3):
+            way = 0.0
+            for k in range(4):
+                way += edge.weights[i, k] * tissue.rest[edge.corners[i, k], c]
+                way -= edge.weights[first, k] * tissue.rest[edge.corners[first, k], c]
+            at_rest += way**2
+            apart += (edge.points[i, c] - edge.points[first, c]) ** 2
+        rest += length * (np.sqrt(at_rest / apart) if apart > 0.0 else 1.0)
+        now += length
+    return rest / now
 
 
 @inner
@@ -178,7 +213,8 @@ def _measure_spans(edge, device, tissue):
             reached = 0
             while reached < _TESTS and found[reached] >= 0:
                 reached += 1
-            edge.spans[i] += reached / _TESTS - 0.5
+            # The end is somewhere between the last place inside and the first outside.
+            edge.spans[i] += min((reached + 0.5) / _TESTS, 1.0) - 0.5
         if inside[i]:
             edge.spans[i] = max(edge.spans[i], 1.0 / _TESTS)
 
