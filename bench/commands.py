@@ -294,8 +294,11 @@ def same_cut(
 def faults(
     count: Annotated[int, typer.Option(min=1, help='How many faults.')] = 60,
     until: Annotated[
-        Literal['nearest', 'near', 'usual', 'all'],
-        typer.Option(help='Last round: 4 or 16 test files; all of `trainer test`; of `--all`.'),
+        Literal['quick', 'nearest', 'near', 'usual', 'all'],
+        typer.Option(
+            help='Last round: quick tests of 8 files; 4 or 16 files; all of `trainer test`; of '
+            '`--all`.'
+        ),
     ] = 'usual',
     folder: Annotated[
         Path, typer.Option(help='Keeps state and copy of the commit: an interrupted run goes on.')

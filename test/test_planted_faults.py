@@ -85,7 +85,7 @@ class StubCopy:
         self.runs += 1
         if number == self.interrupt_at:
             raise KeyboardInterrupt
-        if tier == 'usual':
+        if tier == 'quick':
             unreliable = '--deselect=test/test_x.py::test_x' in options
             return Outcome(None if number and unreliable else 'test/test_x.py::test_x', 1.0)
         return Outcome('test/test_x.py::test_x' if fault or number else None, 1.0)
@@ -99,13 +99,13 @@ def test_an_interrupted_run_goes_on_with_the_fault_it_was_at(
     faults = [replace(fault, kernel=False) for fault in drawn[:3]]  # tried in this order
     monkeypatch.setattr(run, 'draw', lambda *_: faults)
     with pytest.raises(KeyboardInterrupt):
-        run.run_faults(ROOT, tmp_path, 3, 0, 'nearest')
+        run.run_faults(ROOT, tmp_path, 3, 0, 'quick')
     state = tmp_path / 'seed-0.jsonl'
     first, second, third = run.load_trials(state, list)
     assert (first.verdict, first.test) == ('found', 'test/test_x.py::test_x')
     assert (second.verdict, second.unreliable) == ('survived', ['test/test_x.py::test_x'])
     assert third.verdict == ''
     monkeypatch.setattr(StubCopy, 'interrupt_at', -1)
-    assert run.run_faults(ROOT, tmp_path, 3, 0, 'nearest') == run.Status.FAILED
+    assert run.run_faults(ROOT, tmp_path, 3, 0, 'quick') == run.Status.FAILED
     again = run.load_trials(state, list)
     assert again[:2] == [first, second] and again[2].verdict == 'survived'

@@ -128,13 +128,16 @@ def test_a_contact_of_before_a_cut_that_took_nodes_away_is_none_of_its_nodes() -
             {'header': SimpleNamespace(frame_id='arm', stamp=contact().header.stamp)},
             'wrong frame',
         ),
-        (
-            {
-                'header': SimpleNamespace(
-                    frame_id='tissue', stamp=SimpleNamespace(sec=0, nanosec=2**32 - 1)
-                )
-            },
-            'no such time',
+        *(
+            (
+                {
+                    'header': SimpleNamespace(
+                        frame_id='tissue', stamp=SimpleNamespace(sec=0, nanosec=nanoseconds)
+                    )
+                },
+                'no such time',
+            )
+            for nanoseconds in (10**9, 2**32 - 1)
         ),
     ],
 )

@@ -165,7 +165,7 @@ class Copy:
         return read_outcome(log.read_text(errors='replace'), status, time.monotonic() - start)
 
 
-MAX_WALL_S = 3600.0
+MAX_WALL_S = 1800.0
 """[s] for one run of tests."""
 
 

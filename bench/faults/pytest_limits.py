@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import Phase, settings
 
-MAX_CPU_S = 300.0
+MAX_CPU_S = 180.0
 """[s] for one test, of which compiling takes most."""
 
 

@@ -14,11 +14,11 @@ from bench.faults.copy import Copy, Outcome
 from bench.faults.suspects import likely_tests
 from cutting_trainer.session.exit_status import Status
 
-ROUNDS = ('nearest', 'near', 'usual', 'all')
-"""Rounds of tests: the files most likely to find it, the next ones, the rest of `./trainer test`,
-and those of `--all` alone."""
-MAX_NEAREST, MAX_NEAR = 4, 16
-"""Test files of the first round, and of the first two."""
+ROUNDS = ('quick', 'nearest', 'near', 'usual', 'all')
+"""Rounds of tests: the quick ones of the files most likely to find it, all of the most likely
+files, the next ones, the rest of `./trainer test`, and those of `--all` alone."""
+MAX_QUICK, MAX_NEAREST, MAX_NEAR = 8, 4, 16
+"""Test files of the first round, of the second, and of the second and third."""
 FOUND, SURVIVED = 'found', 'survived'
 
 
@@ -75,15 +75,16 @@ def try_round(trial: Trial, name: str, copy: Copy) -> None:
     """Run one round for one fault: the first test that fails with it, and not without, found it."""
     ordered = likely_tests(copy.root, trial.fault)
     tests = {
+        'quick': ordered[:MAX_QUICK],
         'nearest': ordered[:MAX_NEAREST],
         'near': ordered[MAX_NEAREST:MAX_NEAR],
         'usual': ordered[MAX_NEAR:],
         'all': ordered,
     }[name]
     options = ('-m', 'thorough') if name == 'all' else ()
+    tier = name if name in ('quick', 'all') else 'usual'
     while True:
         left_out = [f'--deselect={test}' for test in trial.unreliable]
-        tier = 'all' if name == 'all' else 'usual'
         outcome = copy.run(tests, tier, trial.number, trial.fault, *options, *left_out)
         trial.seconds += round(outcome.seconds, 1)
         if outcome.failed is None:

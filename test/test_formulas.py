@@ -1,0 +1,196 @@
+"""Small formulas inside kernels, against their definition and against SciPy."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from meshes import irregular_box
+from scipy.linalg import polar
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from cutting_trainer.cutting.lookup import DONE, EDGES
+from cutting_trainer.cutting.parting import _gather as gather_around
+from cutting_trainer.cutting.snapping import PENDING, _can_join
+from cutting_trainer.haptic_bridge.emulated_arm.hand import _tremble
+from cutting_trainer.haptic_bridge.force_kernels import _rotate
+from cutting_trainer.haptic_bridge.proxy.surface import LEAF_SIZE, _fitted_boxes
+from cutting_trainer.tissue_sim.elasticity import stiffening_simd
+from cutting_trainer.tissue_sim.elasticity.adaptive_law import _element_norms, add_tangent_rows
+from cutting_trainer.tissue_sim.elasticity.corotational import KEPT
+from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
+from cutting_trainer.tissue_sim.elasticity.rotation import (
+    LANES,
+    ROTATION,
+    SLOTS,
+    TURN,
+    rotation_step,
+)
+from cutting_trainer.tissue_sim.elasticity.stiffening import MAX_EXPONENT
+from cutting_trainer.tissue_sim.elasticity.viscosity import _conjugate
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.motion.far_field import _strain_domains
+
+GRADIENT = np.array([[0.3, -0.2, 0.1], [0.05, -0.25, 0.15], [-0.1, 0.2, 0.4]])
+"""Of a homogeneous displacement: no two entries are alike."""
+
+
+@pytest.fixture(scope='module')
+def tissue() -> ElasticModel:
+    """Of more nodes than a chunk of lanes has."""
+    mesh = TetMesh(*irregular_box((4, 4, 3), 0.01, 5))
+    return ElasticModel(mesh, Material(3000.0, 0.4, 1000.0, stiffening=6.0), 'stiffening')
+
+
+def test_a_vector_is_turned_by_the_tools_orientation_and_back() -> None:
+    rng = np.random.default_rng(2)
+    for rotation in Rotation.random(20, random_state=3):
+        v, out = rng.standard_normal(3), np.zeros(3)
+        _rotate(rotation.as_quat(), v, 1.0, out)
+        np.testing.assert_allclose(out, rotation.apply(v), atol=1e-14)
+        _rotate(rotation.as_quat(), v, -1.0, out)
+        np.testing.assert_allclose(out, rotation.inv().apply(v), atol=1e-14)
+
+
+def test_a_step_of_the_rotation_is_newtons_and_ends_at_the_polar_decomposition() -> None:
+    rng = np.random.default_rng(4)
+    gradients = np.eye(3) + rng.uniform(-0.35, 0.35, (LANES, 3, 3))
+    chunk = np.zeros(SLOTS * LANES)
+    slots = chunk.reshape(SLOTS, LANES)
+    slots[:9], slots[ROTATION] = gradients.reshape(LANES, 9).T, 1.0
+    rotation_step(chunk)
+    for lane, f in enumerate(gradients):
+        axial = np.array([f[2, 1] - f[1, 2], f[0, 2] - f[2, 0], f[1, 0] - f[0, 1]])
+        step = np.linalg.solve(np.trace(f) * np.eye(3) - (f + f.T) / 2, axial)
+        assert slots[TURN, lane] == pytest.approx((step / 2) @ (step / 2), rel=1e-12)
+    for _ in range(8):
+        rotation_step(chunk)
+    assert slots[TURN].max() < 1e-28
+    w, x, y, z = slots[ROTATION : ROTATION + 4]
+    found = Rotation.from_quat(np.array([x, y, z, w]).T).as_matrix()
+    np.testing.assert_allclose(found, [polar(f)[0] for f in gradients], atol=1e-12)
+
+
+@pytest.mark.parametrize('exponent', [1e-3, 0.5, 0.9 * MAX_EXPONENT, 1.1 * MAX_EXPONENT, 8.0])
+def test_the_energy_of_a_stress_alone_is_legendres_transform_of_the_laws(exponent: float) -> None:
+    mu, b = 1800.0, 6.0
+
+    def energy(size: float) -> float:
+        y = 2.0 * b * size * size
+        beyond = max(y - MAX_EXPONENT, 0.0)
+        return mu / (2.0 * b) * (math.exp(y - beyond) * (1.0 + beyond) - 1.0)
+
+    strain = math.sqrt(exponent / (2.0 * b))
+    stress = 2.0 * mu * math.exp(min(exponent, MAX_EXPONENT)) * strain
+    best = minimize_scalar(
+        lambda e: energy(e) - stress * e, bounds=(0.0, 2 * strain), options={'xatol': 1e-9}
+    )
+    law = np.array([mu, 0.0, 0.0, b])
+    assert _conjugate(stress * stress, law) == pytest.approx(-best.fun, rel=1e-6)
+    law[3] = 0.0
+    assert _conjugate(stress * stress, law) == pytest.approx(stress * stress / (4.0 * mu))
+
+
+def test_rows_of_an_element_have_the_norms_of_its_shape_functions() -> None:
+    rng = np.random.default_rng(6)
+    g, nodes, lane = rng.standard_normal((4, 3)), np.array([7, 2, 5, 0]), 3
+    corners = np.zeros(4 * LANES, np.int64)
+    corners[lane::LANES] = 3 * nodes
+    rows = np.ones(8)
+    _element_norms(SimpleNamespace(corners=corners), lane, g.ravel(), 0.25, rows)
+    norms, expected = np.linalg.norm(g, axis=1), np.ones(8)
+    expected[nodes] += 0.25 * norms * norms.sum()
+    np.testing.assert_allclose(rows, expected, rtol=1e-14)
+
+
+def test_every_domain_of_a_homogeneous_strain_has_it(tissue: ElasticModel) -> None:
+    operands, u = tissue.operands(), (tissue.mesh.rest @ GRADIENT.T).ravel()
+    count = len(operands.domains.used)
+    assert count > LANES
+    squares = np.zeros(count)
+    _strain_domains(operands.domains, u, squares)
+    np.testing.assert_allclose(squares, (GRADIENT**2).sum(), rtol=1e-9)
+    rows, strain = np.zeros(tissue.mesh.node_count), np.zeros(6)
+    parts = operands.law, operands.domains, operands.elements, operands.spans, operands.chunks
+    add_tangent_rows(*parts, u, rows, strain)
+    stretches = np.linalg.svd(np.eye(3) + GRADIENT)[1]
+    assert strain[0] == count
+    ratio = np.prod(stretches)
+    np.testing.assert_allclose(strain[2:4], [min(ratio, 1.0), max(ratio, 1.0)], rtol=1e-9)
+    np.testing.assert_allclose(strain[4:], [stretches.min(), stretches.max()], rtol=1e-6)
+    assert (rows > 0).all()
+
+
+def test_every_element_of_a_homogeneous_strain_has_its_gradient_and_volume(
+    tissue: ElasticModel,
+) -> None:
+    elements, u = tissue.operands().elements, (tissue.mesh.rest @ GRADIENT.T).ravel()
+    groups = np.array([LANES, 0, 3 * stiffening_simd.GROUP])
+    width, mu = len(groups) * stiffening_simd.GROUP, 700.0
+    chunk = np.full((stiffening_simd.SLOTS_OF_LAW, LANES), np.nan)
+    shapes = np.zeros(stiffening_simd._SLOTS_OF_SHAPES * LANES)
+    stiffening_simd._gather(elements, groups, u, mu, chunk.ravel(), shapes)
+    found = chunk[:9, :width]
+    np.testing.assert_allclose(found, np.tile(GRADIENT.ravel()[:, None], width), atol=1e-12)
+    tets = (groups[:, None] + np.arange(stiffening_simd.GROUP)).ravel()
+    expected = elements.data[(tets // LANES * KEPT + 13) * LANES + tets % LANES] / (2.0 * mu)
+    np.testing.assert_allclose(chunk[stiffening_simd.VOLUME, :width], expected)
+    assert (chunk[stiffening_simd.VOLUME, width:] == 0.0).all(), 'lanes without an element'
+
+
+def test_tremor_is_the_sum_of_its_tones_on_each_axis() -> None:
+    rng = np.random.default_rng(8)
+    tones, angles = rng.uniform(50, 80, (3, 5)), rng.uniform(0, 6, (3, 5))
+    position, velocity = np.ones(3), np.zeros(3)
+    _tremble(0.7, 2e-4, tones, angles, position, velocity)
+    phase = tones * 0.7 + angles
+    np.testing.assert_allclose(position, 1.0 + 2e-4 * np.sin(phase).sum(axis=1))
+    np.testing.assert_allclose(velocity, 2e-4 * (tones * np.cos(phase)).sum(axis=1))
+
+
+def test_boxes_of_the_surface_fit_their_triangles_over_a_frame() -> None:
+    rng = np.random.default_rng(9)
+    start = rng.uniform(-1, 1, (30, 3))
+    end, triangles = start + rng.uniform(-0.1, 0.1, (30, 3)), rng.integers(0, 30, (37, 3))
+    boxes = _fitted_boxes(start, end, triangles)
+    leaves = (len(boxes) + 1) // 2
+    for leaf, box in enumerate(boxes[leaves - 1 :]):
+        own = triangles[leaf * LEAF_SIZE : (leaf + 1) * LEAF_SIZE]
+        both = np.concatenate([start[own], end[own]]).reshape(-1, 3)
+        if len(own):
+            np.testing.assert_array_equal(box, [*both.min(axis=0), *both.max(axis=0)])
+    both = np.concatenate([start[triangles], end[triangles]]).reshape(-1, 3)
+    np.testing.assert_array_equal(boxes[0], [*both.min(axis=0), *both.max(axis=0)])
+
+
+def test_a_node_joins_the_cut_unless_an_edge_of_it_is_cut() -> None:
+    tables = SimpleNamespace(
+        counts={EDGES: 3},
+        edge_state=[DONE, PENDING, DONE],
+        edge_nodes=np.array([[1, 2], [5, 6], [3, 4]]),
+    )
+    assert [_can_join(tables, node) for node in range(7)] == [
+        True, False, False, False, False, True, True,
+    ]  # fmt: skip
+
+
+def test_elements_around_a_line_are_those_reached_within_its_region(tissue: ElasticModel) -> None:
+    mesh = tissue.mesh
+    line, region = np.array([[0.0, 0.02, 0.015], [0.02, 0.02, 0.015]]), 0.009
+    away = np.maximum(np.abs(mesh.rest[:, 0] - 0.01) - 0.01, 0.0)
+    distance = np.sqrt(away**2 + ((mesh.rest - line[0])[:, 1:] ** 2).sum(axis=1))
+    near = np.flatnonzero(distance < region)
+    removed = np.flatnonzero((mesh.tetrahedra == near[0]).any(axis=1))[:2]
+    found = gather_around(
+        mesh.links, mesh.rest, np.arange(mesh.node_count), removed, line, region, 1
+    )
+    around = np.flatnonzero(np.isin(mesh.tetrahedra, near).any(axis=1))
+    np.testing.assert_array_equal(found, np.setdiff1d(around, removed))
+    assert 0 < len(near) < mesh.node_count
+    further = gather_around(mesh.links, mesh.rest, near[:1], removed[:0], line, region, 40)
+    middles = mesh.rest[mesh.tetrahedra].mean(axis=1)
+    away = np.maximum(np.abs(middles[:, 0] - 0.01) - 0.01, 0.0)
+    inside = np.sqrt(away**2 + ((middles - line[0])[:, 1:] ** 2).sum(axis=1)) < region
+    assert set(np.flatnonzero(inside)) <= set(further)
