@@ -70,8 +70,8 @@ _OTHER_LIVER = {
     'density': Number(1060.0, 'borrowed', f'human liver: {_ACOUSTIC}'),
 }
 _HARDENS = (
-    'human liver, from E and the ultimate stress of 0.27 MPa at a true strain of 0.38, taken as true '
-    f'stress of an incompressible bar: {_ACOUSTIC}'
+    'human liver, from E and the ultimate stress of 0.27 MPa at a true strain of 0.38, taken as '
+    f'true stress of an incompressible bar: {_ACOUSTIC}'
 )
 _STIFFENS = Number(9.2, 'borrowed', _HARDENS)
 _BLADE = f'middle of 187 to 225 J/m^2, porcine liver, blade: {_REVIEW}'

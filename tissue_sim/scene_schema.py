@@ -69,8 +69,8 @@ class MaterialSettings(SceneModel):
     prony: Annotated[tuple[PronyTerm, ...], BeforeValidator(_as_tuple)] = Field(
         default=(),
         max_length=2,
-        description='viscosity: up to two terms [g, tau]: share of the shear modulus that relaxes (in '
-        'sum up to 0.95) and its time [s] from 0.005 up to 1e4',
+        description='viscosity: up to two terms [g, tau]: share of the shear modulus that relaxes '
+        '(in sum up to 0.95) and its time [s] from 0.005 up to 1e4',
     )
     blade_friction: float = Field(
         default=20.0,
@@ -83,7 +83,8 @@ class MaterialSettings(SceneModel):
         default=0.0,
         ge=0,
         le=2,
-        description='dry friction of the tool on the surface: tangential over normal force [-], 0 to 2',
+        description='dry friction of the tool on the surface: tangential over normal force [-], 0 '
+        'to 2',
     )
     static_friction_ratio: float = Field(
         default=1.0,
@@ -134,8 +135,8 @@ class RegionSettings(SceneModel):
     label: int = Field(
         ge=-(2**31),
         lt=2**31,
-        description='its number in the mesh file [-]: physical group of Gmsh, medit:ref, or cell data '
-        'of the name cell_tags, region or label',
+        description='its number in the mesh file [-]: physical group of Gmsh, medit:ref, or cell '
+        'data of the name cell_tags, region or label',
     )
     preset: PresetName | None = Field(
         default=None, description='named material that fills in the values not given here'
@@ -239,8 +240,8 @@ class Integration(SceneModel):
         default=3.0,
         ge=1,
         le=1000,
-        description='how far cuts may raise the highest frequency before small nodes get more mass [-], '
-        '1 to 1000',
+        description='how far cuts may raise the highest frequency before small nodes get more mass '
+        '[-], 1 to 1000',
     )
     min_substeps: int = Field(
         default=1,
@@ -278,12 +279,8 @@ class ActiveRegionSettings(SceneModel):
 class TissueSettings(SceneModel):
     """Section `tissue` of a scene."""
 
-    mesh: ScenePath = Field(
-        description='file of tetrahedra, relative to the scene'
-    )
-    unit: Literal['m', 'cm', 'mm'] = Field(
-        default='m', description='unit of the mesh file'
-    )
+    mesh: ScenePath = Field(description='file of tetrahedra, relative to the scene')
+    unit: Literal['m', 'cm', 'mm'] = Field(default='m', description='unit of the mesh file')
     material: MaterialSettings = Field(
         description='preset, or youngs_modulus, poissons_ratio and density'
     )
@@ -291,8 +288,8 @@ class TissueSettings(SceneModel):
         default=(),
         max_length=MAX_REGIONS,
         description='regions with a material of their own, up to 32; values absent here, and '
-        "Poisson's ratio, stiffening, prony and dry friction, are those of `material`, which should "
-        'be that of the surface under the tool',
+        "Poisson's ratio, stiffening, prony and dry friction, are those of `material`, which "
+        'should be that of the surface under the tool',
     )
     damping: Damping = Field(default=Damping(), description='alpha [1/s] and beta [s]')
     fixed: tuple[FixedRegion, ...] = Field(
@@ -319,8 +316,8 @@ class TissueSettings(SceneModel):
         default=0.0,
         ge=0,
         le=0.01,
-        description='width w of the slit that the tip of the blade opens [m], 0 to 0.01; it goes in '
-        'where the work of the dent reaches toughness times w times its depth, then resists by '
+        description='width w of the slit that the tip of the blade opens [m], 0 to 0.01; it goes '
+        'in where the work of the dent reaches toughness times w times its depth, then resists by '
         'toughness times w. To enter at a force F choose F / (2.5 toughness). 0: it goes in by '
         'cut_threshold, and its tip resists by nothing',
     )

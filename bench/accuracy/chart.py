@@ -39,11 +39,11 @@ _PAGE = """# Speed against accuracy
 
 Written by `./trainer chart`: every elastic model with every integrator, on problems whose solution
 is known by other means (named at the axis). Each scene's method is on the front of the panel that
-resembles it (`test/test_chart.py`). Other packages bend the beam [too](performance.md#beside-others).
+resembles it (`test/test_chart.py`). [Others](performance.md#beside-others) bend the beam too.
 [All digits](charts/points.csv).
 
-- **CPU time** is that of one thread at {safety:g} of the stable step. On this machine ({machine}) a
-  force of the linear model took {reference_cost:.1f} ns a tetrahedron, before and after {after:.1f}.
+- **CPU time** is that of one thread at {safety:g} of the stable step. A force of the linear model
+  took {reference_cost:.1f} ns a tetrahedron, and {after:.1f} at the end ({machine}).
 - **Error** belongs to model and mesh; the integrator matters in free vibration only.
 - Damping: alpha {alpha:g} 1/s, beta {beta:g} s (active region: {region_alpha:g} 1/s,
   {region_beta:g} s); none in free vibration, where forward Euler has no stable step. Implicit

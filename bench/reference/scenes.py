@@ -39,7 +39,7 @@ EXPLAINED = {
     'tissue.contact': '[load of the tool](method.md#contact)',
     'tissue.integrator': '[integrator](method.md#motion)',
     'haptics.extrapolation': '[force between two frames](haptics.md#from-pose-to-force)',
-    'haptics.forces': '[tissue\'s reaction, or force of the spring](haptics.md#two-forces-or-one)',
+    'haptics.forces': "[tissue's reaction, or force of the spring](haptics.md#two-forces-or-one)",
     'cutting.method': '[method of cutting](cutting.md)',
 }
 """Keys whose choices a page explains, and the link to it."""
