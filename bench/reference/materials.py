@@ -14,10 +14,10 @@ _PAGE = """# Materials
 
 Values of `tissue.material.preset`. In brackets: the number of the source, and how the value was
 had. It was read in a *t*able, on a *p*age or in an *a*bstract, *c*omputed from such a number,
-*b*orrowed from another species, or chosen (*x*) for want of a source. A dash was looked for and not found, for
-each preset also {nowhere}. The scene must then give `density`; `toughness` has its
-default of {toughness:g} J/m^2, the others 0. Beside `tissue.regions[].preset` an absent value is
-that of `tissue.material`.
+*b*orrowed from another species, or chosen (*x*) for want of a source. A dash was looked for and not
+found, for each preset also {nowhere}. The scene must then give `density`;
+`toughness` has its default of {toughness:g} J/m^2, the others 0. Beside `tissue.regions[].preset`
+an absent value is that of `tissue.material`.
 
 {numbers}
 
