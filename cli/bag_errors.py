@@ -30,7 +30,7 @@ def reading(bag: Path) -> Iterator[None]:
         if isinstance(error, ValueError) and not _is_of_content(error):
             raise
         raise BagError(
-            f'{bag} cannot be used: what is in it is not what a session has '
+            f'{bag} cannot be used: its content is not that of a session '
             f'({type(error).__name__} in {_place(error)}: {" ".join(str(error).split())[:200]})'
         ) from error
 

@@ -168,8 +168,8 @@ def set_up(folder: Path, jazzy: str | None, *, ready: bool, needed: int) -> Find
     if free < needed and not (folder / 'env').exists():
         remedy = f'make room: setting up takes {needed / 1e9:g} GB'
         return Finding('set-up', 'error', f'{free / 1e9:.1f} GB free in {there}', remedy)
-    remedy = 'run `./trainer setup`; every command does it when it is due'
-    what = f'not made, not finished, or of other sources, {ros}'
+    remedy = 'run `./trainer setup`, or any command, which sets up first'
+    what = f'missing, unfinished, or made from other sources, {ros}'
     return Finding('set-up', 'warning', what, remedy)
 
 
@@ -190,7 +190,7 @@ def dds(python: str | None, environ: Mapping[str, str]) -> Finding:
     except subprocess.TimeoutExpired:
         return Finding('dds', 'error', f'no answer in {DDS_TIMEOUT:g} s', _dds_remedy(environ))
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or ['nothing was said'])[-1]
+        said = (done.stderr.strip().splitlines() or ['no output'])[-1]
         return Finding('dds', 'error', said, _dds_remedy(environ))
     return Finding('dds', 'ok', done.stdout.strip())
 
@@ -231,7 +231,7 @@ def page_port() -> Finding:
     """Return the TCP port of the page in the browser."""
     if _free(socket.SOCK_STREAM, PAGE_PORT):
         return Finding('page port', 'ok', f'free: TCP {PAGE_PORT}')
-    remedy = 'a page in the browser needs another port: give it `--port 0`'
+    remedy = 'give `./trainer view` another port: `--port 0`'
     return Finding('page port', 'warning', f'TCP {PAGE_PORT} is in use', remedy)
 
 
@@ -344,7 +344,7 @@ def disk(folder: Path) -> Finding:
     free = shutil.disk_usage(there).free
     found = f'{free / 1e9:.1f} GB free for bags in {there}'
     if free < BAG_SPACE:
-        remedy = 'make room: a recorder without any goes on and counts what it loses'
+        remedy = 'make room: on a full disk the recorder loses messages'
         return Finding('disk', 'warning', found, remedy)
     return Finding('disk', 'ok', found)
 
@@ -364,6 +364,6 @@ def kernel_cache(folder: Path, *, current: bool) -> Finding:
     if sizes and current:
         found = f'{len(sizes)} kernels, {sum(sizes) / 1e6:.0f} MB in {folder}'
         return Finding('kernel cache', 'ok', found)
-    what = 'of other sources' if sizes else 'none compiled'
+    what = 'made from other sources' if sizes else 'none compiled'
     remedy = 'run `./trainer setup`, which compiles them (a minute or two)'
     return Finding('kernel cache', 'warning', f'{what} in {folder}', remedy)

@@ -80,7 +80,7 @@ def message_packages(folder: Path) -> dict[str, Path]:
         name = re.search(r'<name>\s*([^<\s]+)\s*</name>', path.read_text(errors='replace'))
         if any((path.parent / kind).is_dir() for kind in INTERFACES) and name:
             if not PACKAGE_NAME.fullmatch(name[1]):
-                raise OverlayError(f'{path}: {name[1][:80]!r} is no name of a package')
+                raise OverlayError(f'{path}: {name[1][:80]!r} is not a package name')
             found[name[1]] = path.parent
     return found
 

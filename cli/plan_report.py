@@ -1,4 +1,4 @@
-"""The command `trainer plan`: the least method that meets a scene's budget."""
+"""The command `trainer plan`: the cheapest method that meets a scene's budget."""
 
 import json
 from dataclasses import asdict
