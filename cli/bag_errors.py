@@ -14,7 +14,7 @@ _OF_CONTENT = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeEr
 
 @contextmanager
 def reading(bag: Path) -> Iterator[None]:
-    """Say of a bag that its content is not a session's, where a command cannot make sense of it.
+    """Turn an error about the content of a bag into one sentence that names the bag.
 
     Definitions and messages of a bag are whatever its maker liked. The sentence names the place in
     the code, for the case that the bag is right and the trainer is not.

@@ -1,4 +1,4 @@
-"""`trainer doctor`: what of this machine the trainer needs, what is wrong with it, what to do.
+"""`trainer doctor`: check this machine for the trainer; each finding has a remedy.
 
 Standard library only, and nothing of ours but what is the same: it must run before setting up has.
 """
@@ -38,7 +38,7 @@ GOOD_CLOCKS = ('tsc', 'kvm-clock', 'arch_sys_counter', 'hyperv_clocksource_tsc_p
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """Result of one check.
 
     Attributes:
         check: its name.
@@ -147,7 +147,7 @@ def line(finding: Finding, *, colour: bool) -> str:
 
 
 def running_python() -> Finding:
-    """Return the interpreter that runs this: where no launcher has chosen one."""
+    """Check the interpreter that runs this, where no launcher has chosen one."""
     return Finding('python', 'ok', f'{sys.version.split()[0]} at {sys.executable}')
 
 
@@ -174,7 +174,7 @@ def set_up(folder: Path, jazzy: str | None, *, ready: bool, needed: int) -> Find
 
 
 def dds(python: str | None, environ: Mapping[str, str]) -> Finding:
-    """Return one message from a publisher to a subscriber, in the transport of the nodes."""
+    """Check that a message arrives through DDS, in the transport of the nodes."""
     if python is None:
         return Finding('dds', 'warning', 'not tried', 'run `./trainer setup`, then this again')
     command = [python, '-m', 'cutting_trainer.cli.dds_loopback']
@@ -206,7 +206,7 @@ def _dds_remedy(environ: Mapping[str, str]) -> str:
 
 
 def ports(domain: str) -> Finding:
-    """Return the UDP ports of the ROS domain: free, or shared with whom."""
+    """Check the UDP ports of the ROS domain: free, or in use."""
     if not domain.isdecimal() or int(domain) > MAX_DOMAIN:
         return Finding(
             'ports',
@@ -228,7 +228,7 @@ def ports(domain: str) -> Finding:
 
 
 def page_port() -> Finding:
-    """Return the TCP port of the page in the browser."""
+    """Check the TCP port of the page in the browser."""
     if _free(socket.SOCK_STREAM, PAGE_PORT):
         return Finding('page port', 'ok', f'free: TCP {PAGE_PORT}')
     remedy = 'give `./trainer view` another port: `--port 0`'
@@ -248,7 +248,7 @@ def _free(kind: socket.SocketKind, port: int) -> bool:
 
 
 def real_time() -> Finding:
-    """Return whether a process of this user may have the priority of the 1 kHz loops."""
+    """Check whether a process of this user may have the priority of the 1 kHz loops."""
     child = os.fork()
     if child == 0:
         status = 0
@@ -272,7 +272,7 @@ def real_time() -> Finding:
 
 
 def cores() -> Finding:
-    """Return how many there are for this process, and how busy."""
+    """Check the number of cores for this process, and their load."""
     count = len(os.sched_getaffinity(0))
     load = os.getloadavg()[0]
     found = f'{count}, load {load:.1f}'
@@ -287,7 +287,7 @@ def cores() -> Finding:
 def clock_source(
     path: Path = Path('/sys/devices/system/clocksource/clocksource0/current_clocksource'),
 ) -> Finding:
-    """Return how the kernel reads the time: some ways take microseconds."""
+    """Check the clock source of the kernel: some take microseconds to read."""
     try:
         name = path.read_text().strip()
     except OSError:
@@ -316,7 +316,7 @@ class _Timex(ctypes.Structure):
 
 
 def time_sync() -> Finding:
-    """Return whether something keeps the system clock to the time of others, as the kernel knows
+    """Check whether something keeps the system clock to the time of others, as the kernel knows
     it.
     """
     timex = _Timex()
@@ -335,7 +335,7 @@ def time_sync() -> Finding:
 
 
 def disk(folder: Path) -> Finding:
-    """Return room for bags, and whether they can be written here."""
+    """Check the room for bags, and whether they can be written here."""
     sessions = folder / 'bags' / 'sessions'
     there = next(p for p in (sessions, *sessions.parents) if p.exists())
     if not os.access(there, os.W_OK):
@@ -350,7 +350,7 @@ def disk(folder: Path) -> Finding:
 
 
 def kernel_cache(folder: Path, *, current: bool) -> Finding:
-    """Return the compiled kernels: without them, or with those of other sources, a start takes
+    """Check the compiled kernels: without them, or with those of other sources, a start takes
     minutes.
 
     Args:
