@@ -45,8 +45,8 @@ class ToolSettings(SceneModel):
     )
     mode: Literal['scalpel', 'palpator'] = Field(
         'scalpel',
-        description='what the tool is at first; a palpator never goes in. The parameter '
-        '`tool_mode` of haptic_bridge, or `device.mode_button`, changes it',
+        description='mode at first; a palpator never goes in. The parameter `tool_mode` of '
+        'haptic_bridge, or `device.mode_button`, changes it',
     )
 
     @model_validator(mode='after')

@@ -279,7 +279,9 @@ class ActiveRegionSettings(SceneModel):
 class TissueSettings(SceneModel):
     """Section `tissue` of a scene."""
 
-    mesh: ScenePath = Field(description='file of tetrahedra, relative to the scene')
+    mesh: ScenePath = Field(
+        description='file of tetrahedra that meshio reads, relative to the scene'
+    )
     unit: Literal['m', 'cm', 'mm'] = Field(default='m', description='unit of the mesh file')
     material: MaterialSettings = Field(
         description='preset, or youngs_modulus, poissons_ratio and density'
