@@ -49,7 +49,7 @@ def picture(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Draw a recorded session: the tissue at one moment, the way of the tool, the force."""
+    """Draw a recorded session: the tissue at one moment, the path of the tool, the force."""
     from cutting_trainer.recordings.picture import make_picture
 
     file = output or bag / 'picture.png'
@@ -77,11 +77,11 @@ def replay(
     domain: Domain = '',
     output: Annotated[
         Path | None,
-        typer.Option('--output', '-o', help='Record the replay into a new bag (not as recorded).'),
+        typer.Option('--output', '-o', help='New bag for the replay (not with --as-recorded).'),
     ] = None,
     drive_device: Annotated[
         bool,
-        typer.Option('--drive-device', help='Let the force reach a live device. Without it none.'),
+        typer.Option('--drive-device', help='Let the force reach a live device.'),
     ] = False,
 ) -> None:
     """Play a recorded session into the graph. Space pauses, s steps one frame, q ends."""

@@ -14,7 +14,7 @@ _OF_CONTENT = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeEr
 
 @contextmanager
 def reading(bag: Path) -> Iterator[None]:
-    """Say of a bag that its content is not a session's, where a command cannot make sense of it.
+    """Turn an error about the content of a bag into one sentence that names the bag.
 
     Definitions and messages of a bag are whatever its maker liked. The sentence names the place in
     the code, for the case that the bag is right and the trainer is not.
@@ -30,7 +30,7 @@ def reading(bag: Path) -> Iterator[None]:
         if isinstance(error, ValueError) and not _is_of_content(error):
             raise
         raise BagError(
-            f'{bag} cannot be used: what is in it is not what a session has '
+            f'{bag} cannot be used: its content is not that of a session '
             f'({type(error).__name__} in {_place(error)}: {" ".join(str(error).split())[:200]})'
         ) from error
 

@@ -1,4 +1,4 @@
-"""`trainer completion`: what the shell needs to complete commands, options and their values.
+"""`trainer completion`: scripts that complete commands, options and values in the shell.
 
 The script has the words in it, so that a Tab starts no Python. Typer's own script calls the program
 by its bare name and without arguments: there is no `trainer` on the path, and `./trainer` alone is

@@ -1,4 +1,4 @@
-"""Two processes: whether messages come and go through DDS as between nodes, and how soon.
+"""Exchange messages between two processes through DDS, as nodes do, and time them.
 
 Run as `python -m cutting_trainer.cli.dds_loopback`; the domain is `ROS_DOMAIN_ID`. Two processes,
 because within one the middleware hands messages over without its transport.
@@ -17,7 +17,7 @@ TRIPS = 20
 
 
 def echo(name: str) -> None:
-    """Send back what comes, until standard input ends; the other process's side.
+    """Send every message back, until standard input ends; the other process's side.
 
     Args:
         name: that the topics begin with.
@@ -40,7 +40,7 @@ def echo(name: str) -> None:
 
 
 def loopback() -> str:
-    """Send a few messages to another process and back; say what was measured.
+    """Send a few messages to another process and back; return the times as a sentence.
 
     Raises:
         RuntimeError: they do not find each other, or a message does not come.

@@ -1,4 +1,4 @@
-"""`trainer doctor`: what of this machine the trainer needs, what is wrong with it, what to do.
+"""`trainer doctor`: check this machine for the trainer; each finding has a remedy.
 
 Standard library only, and nothing of ours but what is the same: it must run before setting up has.
 """
@@ -38,7 +38,7 @@ GOOD_CLOCKS = ('tsc', 'kvm-clock', 'arch_sys_counter', 'hyperv_clocksource_tsc_p
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """Result of one check.
 
     Attributes:
         check: its name.
@@ -147,7 +147,7 @@ def line(finding: Finding, *, colour: bool) -> str:
 
 
 def running_python() -> Finding:
-    """Return the interpreter that runs this: where no launcher has chosen one."""
+    """Check the interpreter that runs this, where no launcher has chosen one."""
     return Finding('python', 'ok', f'{sys.version.split()[0]} at {sys.executable}')
 
 
@@ -168,13 +168,13 @@ def set_up(folder: Path, jazzy: str | None, *, ready: bool, needed: int) -> Find
     if free < needed and not (folder / 'env').exists():
         remedy = f'make room: setting up takes {needed / 1e9:g} GB'
         return Finding('set-up', 'error', f'{free / 1e9:.1f} GB free in {there}', remedy)
-    remedy = 'run `./trainer setup`; every command does it when it is due'
-    what = f'not made, not finished, or of other sources, {ros}'
+    remedy = 'run `./trainer setup`, or any command, which sets up first'
+    what = f'missing, unfinished, or made from other sources, {ros}'
     return Finding('set-up', 'warning', what, remedy)
 
 
 def dds(python: str | None, environ: Mapping[str, str]) -> Finding:
-    """Return one message from a publisher to a subscriber, in the transport of the nodes."""
+    """Check that a message arrives through DDS, in the transport of the nodes."""
     if python is None:
         return Finding('dds', 'warning', 'not tried', 'run `./trainer setup`, then this again')
     command = [python, '-m', 'cutting_trainer.cli.dds_loopback']
@@ -190,7 +190,7 @@ def dds(python: str | None, environ: Mapping[str, str]) -> Finding:
     except subprocess.TimeoutExpired:
         return Finding('dds', 'error', f'no answer in {DDS_TIMEOUT:g} s', _dds_remedy(environ))
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or ['nothing was said'])[-1]
+        said = (done.stderr.strip().splitlines() or ['no output'])[-1]
         return Finding('dds', 'error', said, _dds_remedy(environ))
     return Finding('dds', 'ok', done.stdout.strip())
 
@@ -206,7 +206,7 @@ def _dds_remedy(environ: Mapping[str, str]) -> str:
 
 
 def ports(domain: str) -> Finding:
-    """Return the UDP ports of the ROS domain: free, or shared with whom."""
+    """Check the UDP ports of the ROS domain: free, or in use."""
     if not domain.isdecimal() or int(domain) > MAX_DOMAIN:
         return Finding(
             'ports',
@@ -228,10 +228,10 @@ def ports(domain: str) -> Finding:
 
 
 def page_port() -> Finding:
-    """Return the TCP port of the page in the browser."""
+    """Check the TCP port of the page in the browser."""
     if _free(socket.SOCK_STREAM, PAGE_PORT):
         return Finding('page port', 'ok', f'free: TCP {PAGE_PORT}')
-    remedy = 'a page in the browser needs another port: give it `--port 0`'
+    remedy = 'give `./trainer view` another port: `--port 0`'
     return Finding('page port', 'warning', f'TCP {PAGE_PORT} is in use', remedy)
 
 
@@ -248,7 +248,7 @@ def _free(kind: socket.SocketKind, port: int) -> bool:
 
 
 def real_time() -> Finding:
-    """Return whether a process of this user may have the priority of the 1 kHz loops."""
+    """Check whether a process of this user may have the priority of the 1 kHz loops."""
     child = os.fork()
     if child == 0:
         status = 0
@@ -272,7 +272,7 @@ def real_time() -> Finding:
 
 
 def cores() -> Finding:
-    """Return how many there are for this process, and how busy."""
+    """Check the number of cores for this process, and their load."""
     count = len(os.sched_getaffinity(0))
     load = os.getloadavg()[0]
     found = f'{count}, load {load:.1f}'
@@ -287,7 +287,7 @@ def cores() -> Finding:
 def clock_source(
     path: Path = Path('/sys/devices/system/clocksource/clocksource0/current_clocksource'),
 ) -> Finding:
-    """Return how the kernel reads the time: some ways take microseconds."""
+    """Check the clock source of the kernel: some take microseconds to read."""
     try:
         name = path.read_text().strip()
     except OSError:
@@ -316,7 +316,7 @@ class _Timex(ctypes.Structure):
 
 
 def time_sync() -> Finding:
-    """Return whether something keeps the system clock to the time of others, as the kernel knows
+    """Check whether something keeps the system clock to the time of others, as the kernel knows
     it.
     """
     timex = _Timex()
@@ -335,7 +335,7 @@ def time_sync() -> Finding:
 
 
 def disk(folder: Path) -> Finding:
-    """Return room for bags, and whether they can be written here."""
+    """Check the room for bags, and whether they can be written here."""
     sessions = folder / 'bags' / 'sessions'
     there = next(p for p in (sessions, *sessions.parents) if p.exists())
     if not os.access(there, os.W_OK):
@@ -344,13 +344,13 @@ def disk(folder: Path) -> Finding:
     free = shutil.disk_usage(there).free
     found = f'{free / 1e9:.1f} GB free for bags in {there}'
     if free < BAG_SPACE:
-        remedy = 'make room: a recorder without any goes on and counts what it loses'
+        remedy = 'make room: on a full disk the recorder loses messages'
         return Finding('disk', 'warning', found, remedy)
     return Finding('disk', 'ok', found)
 
 
 def kernel_cache(folder: Path, *, current: bool) -> Finding:
-    """Return the compiled kernels: without them, or with those of other sources, a start takes
+    """Check the compiled kernels: without them, or with those of other sources, a start takes
     minutes.
 
     Args:
@@ -364,6 +364,6 @@ def kernel_cache(folder: Path, *, current: bool) -> Finding:
     if sizes and current:
         found = f'{len(sizes)} kernels, {sum(sizes) / 1e6:.0f} MB in {folder}'
         return Finding('kernel cache', 'ok', found)
-    what = 'of other sources' if sizes else 'none compiled'
+    what = 'made from other sources' if sizes else 'none compiled'
     remedy = 'run `./trainer setup`, which compiles them (a minute or two)'
     return Finding('kernel cache', 'warning', f'{what} in {folder}', remedy)

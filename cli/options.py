@@ -26,7 +26,7 @@ Changes = Annotated[
     list[str] | None,
     typer.Option(
         '--with',
-        help='key=value of the scene that is to be otherwise; may be given again. Then the '
-        'recorded hand meets the changed tissue, and the differences are shown.',
+        help='Change a key of the scene, as key=value; may be given again. The recorded hand then '
+        'meets the changed tissue, and the differences are shown.',
     ),
 ]

@@ -1,4 +1,4 @@
-"""Takes the message packages of others, as `crtk_msgs`, so that the launcher can build them.
+"""Copies message packages of others, such as `crtk_msgs`, for the launcher to build.
 
 Standard library only: the launcher uses it before anything is set up.
 """
@@ -24,7 +24,7 @@ ament_package()
 
 
 class OverlayError(Exception):
-    """The message says what cannot be taken, and what could."""
+    """A package that cannot be taken; the message says why, and which could."""
 
 
 def take_overlay(target: Path, folders: Sequence[Path], known: Collection[str]) -> None:
@@ -80,7 +80,7 @@ def message_packages(folder: Path) -> dict[str, Path]:
         name = re.search(r'<name>\s*([^<\s]+)\s*</name>', path.read_text(errors='replace'))
         if any((path.parent / kind).is_dir() for kind in INTERFACES) and name:
             if not PACKAGE_NAME.fullmatch(name[1]):
-                raise OverlayError(f'{path}: {name[1][:80]!r} is no name of a package')
+                raise OverlayError(f'{path}: {name[1][:80]!r} is not a package name')
             found[name[1]] = path.parent
     return found
 
@@ -91,7 +91,7 @@ def interface_files(package: Path) -> list[Path]:
 
 
 def used_packages(package: Path) -> set[str]:
-    """Return names of the packages of which the messages in a package are made."""
+    """Return the names of the packages whose messages a package uses."""
     return {
         name
         for file in interface_files(package)
@@ -100,7 +100,7 @@ def used_packages(package: Path) -> set[str]:
 
 
 def copy_package(source: Path, target: Path, needs: set[str]) -> None:
-    """Copy what a package says of its messages, and write how they are built."""
+    """Copy the interface files of a package, and write its build file."""
     text = (source / 'package.xml').read_text(errors='replace')
     version = re.search(r'<version>\s*(\d+\.\d+\.\d+)\s*</version>', text)
     for file in interface_files(source):

@@ -1,4 +1,4 @@
-"""The command `trainer plan`: the least method that meets a scene's budget."""
+"""The command `trainer plan`: the cheapest method that meets a scene's budget."""
 
 import json
 from dataclasses import asdict
@@ -17,7 +17,7 @@ from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 
 def run_plan(scene: str, *, as_json: bool = False) -> Status:
-    """Return plans for a scene and prints the answer.
+    """Plan a scene and print the answer.
 
     Args:
         scene: name or path.

@@ -98,7 +98,7 @@ def view(
 def record(
     output: Annotated[
         Path | None,
-        typer.Option('--output', '-o', help='New folder for the bag (default: as of demo).'),
+        typer.Option('--output', '-o', help='New folder for the bag (default: in bags/sessions).'),
     ] = None,
     scene: Annotated[
         str, typer.Option(help='Scene that the nodes run: its text goes into the bag.')
@@ -138,7 +138,7 @@ def probe_device(
         typer.Option(help='Where below the namespace it takes the force.'),
     ] = 'servo_cf',
     faults: Annotated[
-        str, typer.Option(help='With --emulated: what its driver gets wrong, as in "gain=5".')
+        str, typer.Option(help='With --emulated: faults of its driver, as in "gain=5".')
     ] = '',
     domain: Domain = '',
     as_json: AsJson = False,

@@ -81,7 +81,7 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
 def run_checks(
     checks: Sequence[Check], folder: Path, announce: Callable[[str], None]
 ) -> dict[str, int]:
-    """Run all checks, whatever becomes of each, so that one run tells everything.
+    """Run all checks, also after one has failed.
 
     A test that has passed in a repetition has passed: a process of its own has run it then, with
     fixtures of its own.

@@ -68,7 +68,7 @@ def sim_side(
     partition: Partition = '',
     mesh_bandwidth: Annotated[
         float,
-        typer.Option(min=0, help='Most that goes out for meshes [bytes/s]; 0: no limit.'),
+        typer.Option(min=0, help='Largest flow of meshes [bytes/s]; 0: no limit.'),
     ] = 0.0,
     seed: Seed = 0,
     domain: Domain = '',

@@ -20,7 +20,7 @@ def plan(
     scene: SceneArgument,
     as_json: AsJson = False,
 ) -> None:
-    """Find the least method that meets a scene's budget, and say why not a lesser one."""
+    """Find the cheapest method that meets a scene's budget, and say why cheaper ones fail."""
     from cutting_trainer.cli.plan_report import run_plan
 
     raise typer.Exit(int(run_plan(scene, as_json=as_json)))
@@ -77,9 +77,9 @@ def doctor(
 @commands.command(epilog=EXIT_STATUSES)
 def completion(
     context: typer.Context,
-    shell: Annotated[Literal['bash', 'zsh'], typer.Argument(help='Which shell.')],
+    shell: Annotated[Literal['bash', 'zsh'], typer.Argument(help='Shell to complete in.')],
 ) -> None:
-    """Print what makes the shell complete commands: eval "$(./trainer completion bash)"."""
+    """Print completion for the shell: eval "$(./trainer completion bash)"."""
     from cutting_trainer.cli.completion import script
 
     print(script(context.find_root().command, shell))
@@ -116,10 +116,10 @@ def run(context: typer.Context) -> None:
 def check(
     context: typer.Context,
     quick: Annotated[
-        bool, typer.Option('--quick', help='Only lint and what needs seconds and no graph.')
+        bool, typer.Option('--quick', help='Only lint and tests of seconds without a ROS graph.')
     ] = False,
     everything: Annotated[
-        bool, typer.Option('--all', help='Also what takes long: soaks, faults by chance, builds.')
+        bool, typer.Option('--all', help='Also tests that take long: soak, random faults, builds.')
     ] = False,
 ) -> None:
     """Run the checks of a checkout: lint, format, types, tests; arguments go to pytest."""

@@ -58,7 +58,7 @@ class Network:
             host, _, port = self.server.partition(':')
             if port and not (port.isdecimal() and 0 < int(port) < 1 << 16):
                 raise SessionError(
-                    f'--discovery-server is {self.server!r}: its port is no number up to 65535'
+                    f'--discovery-server is {self.server!r}: the port must be a number up to 65535'
                 )
             found[EVERYTHING] = 'TRUE'  # the recorder must discover topics that it does not know
             found[SERVER] = f'{_host(host, "--discovery-server")}:{port or SERVER_PORT}'

@@ -72,11 +72,11 @@ def change(scene: dict[str, object], key: str, value: str) -> None:
         check_yaml(value)
         new = YAML(typ='safe', pure=True).load(value)
     except (YAMLError, ValueError):
-        raise SessionError(f'--with {key}: {value!r} is no value of a scene file') from None
+        raise SessionError(f'--with {key}: {value!r} is not a value in YAML') from None
     place = scene
     for part in path:
         inner = place.setdefault(part, {})
         if not isinstance(inner, dict):
-            raise SessionError(f'--with {key}: {part} is a value, not a section')
+            raise SessionError(f'--with {key}: {part} has no keys, it is a value')
         place = inner
     place[last] = new

@@ -168,11 +168,6 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
         )
         for side in ('bridge-side', 'sim-side')
     },
-    'sudo apt install ros-jazzy-sros2': PACKAGED,
-    'ROS_DOMAIN_ID=7 ros2 security create_keystore keys': PACKAGED,
-    'ROS_DOMAIN_ID=7 ros2 security create_enclave keys /trainer': PACKAGED,
-    'export ROS_DOMAIN_ID=7 ROS_SECURITY_KEYSTORE=$PWD/keys ROS_SECURITY_ENABLE=true': PACKAGED,
-    'export ROS_SECURITY_STRATEGY=Enforce ROS_SECURITY_ENCLAVE_OVERRIDE=/trainer': PACKAGED,
     './trainer run PROGRAM ...': Nowhere('PROGRAM stands for what others of these commands run'),
     './trainer probe-device --arm /MTML --profile dvrk_mtm': Nowhere('needs a real arm'),
     './trainer bridge-side --no-arm --scene block --bag NEW': Nowhere('needs a real arm'),

@@ -58,22 +58,22 @@ _ACOUSTIC = 'doi 10.1088/1361-6560/ab5010, table 1'
 _REVIEW = 'doi 10.1186/s10033-022-00767-4, table 2'
 _DENSITIES = 'medicalalgorithms.com/density-of-various-organs-and-tissues, after Kaye and Laby'
 _NU = Number(0.45, 'chosen', 'nearly incompressible; linear tetrahedra lock above it')
-_LIVER_E = f'three times the shear modulus of 1.8 +- 0.4 kPa: {_ACOUSTIC}'
+_LIVER_E = f'human liver, three times the shear modulus of 1.8 +- 0.4 kPa: {_ACOUSTIC}'
 _HUMAN_LIVER = {
     'youngs_modulus': Number(5400.0, 'computed', _LIVER_E),
     'poissons_ratio': _NU,
-    'density': Number(1060.0, 'table', _ACOUSTIC),
+    'density': Number(1060.0, 'table', f'human liver: {_ACOUSTIC}'),
 }
 _OTHER_LIVER = {
-    'youngs_modulus': Number(5400.0, 'borrowed', f'human liver, {_LIVER_E}'),
+    'youngs_modulus': Number(5400.0, 'borrowed', _LIVER_E),
     'poissons_ratio': _NU,
     'density': Number(1060.0, 'borrowed', f'human liver: {_ACOUSTIC}'),
 }
 _HARDENS = (
-    'from E and the ultimate stress of 0.27 MPa at a true strain of 0.38, taken as true stress of '
-    f'an incompressible bar: {_ACOUSTIC}'
+    'human liver, from E and the ultimate stress of 0.27 MPa at a true strain of 0.38, taken as '
+    f'true stress of an incompressible bar: {_ACOUSTIC}'
 )
-_STIFFENS = Number(9.2, 'borrowed', f'human liver, {_HARDENS}')
+_STIFFENS = Number(9.2, 'borrowed', _HARDENS)
 _BLADE = f'middle of 187 to 225 J/m^2, porcine liver, blade: {_REVIEW}'
 _TIME = ('prony', 'friction')
 _LARGE = ('stiffening', *_TIME)

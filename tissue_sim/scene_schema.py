@@ -64,14 +64,13 @@ class MaterialSettings(SceneModel):
         default=0.0,
         ge=0,
         le=100,
-        description='b of the law exp(b x) of the model stiffening [-], 0 to 100; 0: neo-Hookean; '
-        'other models do not use it',
+        description='b of the law exp(b x) of the model stiffening [-], 0 to 100; 0: neo-Hookean',
     )
     prony: Annotated[tuple[PronyTerm, ...], BeforeValidator(_as_tuple)] = Field(
         default=(),
         max_length=2,
-        description='viscosity: up to two terms [g, tau], each the share of the shear modulus that '
-        'relaxes, above 0, in sum up to 0.95, and its time [s] from 0.005 up to 1e4; empty: none',
+        description='viscosity: up to two terms [g, tau]: share of the shear modulus that relaxes '
+        '(in sum up to 0.95) and its time [s] from 0.005 up to 1e4',
     )
     blade_friction: float = Field(
         default=20.0,
@@ -84,8 +83,8 @@ class MaterialSettings(SceneModel):
         default=0.0,
         ge=0,
         le=2,
-        description='dry friction of the tool on the surface: tangential over normal force of what '
-        'slides [-], 0 to 2; 0: none',
+        description='dry friction of the tool on the surface: tangential over normal force [-], 0 '
+        'to 2',
     )
     static_friction_ratio: float = Field(
         default=1.0,
@@ -136,11 +135,11 @@ class RegionSettings(SceneModel):
     label: int = Field(
         ge=-(2**31),
         lt=2**31,
-        description='number of its tetrahedra in the mesh file [-]: the physical group of Gmsh, '
-        'medit:ref, or cell data of the name cell_tags, region or label',
+        description='its number in the mesh file [-]: physical group of Gmsh, medit:ref, or cell '
+        'data of the name cell_tags, region or label',
     )
     preset: PresetName | None = Field(
-        default=None, description='named material that fills in what is absent of the values below'
+        default=None, description='named material that fills in the values not given here'
     )
     youngs_modulus: float | None = Field(
         default=None, ge=10, le=1e7, description="Young's modulus [Pa], 10 to 1e7"
@@ -241,8 +240,8 @@ class Integration(SceneModel):
         default=3.0,
         ge=1,
         le=1000,
-        description='how far cuts may raise the highest frequency before small nodes are '
-        'integrated with more mass [-], 1 to 1000',
+        description='how far cuts may raise the highest frequency before small nodes get more mass '
+        '[-], 1 to 1000',
     )
     min_substeps: int = Field(
         default=1,
@@ -281,21 +280,18 @@ class TissueSettings(SceneModel):
     """Section `tissue` of a scene."""
 
     mesh: ScenePath = Field(
-        description='file of tetrahedra that meshio reads, relative to the scene file'
+        description='file of tetrahedra that meshio reads, relative to the scene'
     )
-    unit: Literal['m', 'cm', 'mm'] = Field(
-        default='m', description='unit of length of the mesh file'
-    )
+    unit: Literal['m', 'cm', 'mm'] = Field(default='m', description='unit of the mesh file')
     material: MaterialSettings = Field(
         description='preset, or youngs_modulus, poissons_ratio and density'
     )
     regions: tuple[RegionSettings, ...] = Field(
         default=(),
         max_length=MAX_REGIONS,
-        description='regions of the mesh with a material of their own, up to 32; other '
-        'tetrahedra, and values absent here, have those of `material`, which should be that of the '
-        "surface under the tool. Poisson's ratio, stiffening, prony and dry friction of a region's "
-        'preset are not used',
+        description='regions with a material of their own, up to 32; values absent here, and '
+        "Poisson's ratio, stiffening, prony and dry friction, are those of `material`, which "
+        'should be that of the surface under the tool',
     )
     damping: Damping = Field(default=Damping(), description='alpha [1/s] and beta [s]')
     fixed: tuple[FixedRegion, ...] = Field(
@@ -322,11 +318,10 @@ class TissueSettings(SceneModel):
         default=0.0,
         ge=0,
         le=0.01,
-        description='width w of the slit that the tip of the blade opens: it goes in where the '
-        'work of the dent reaches toughness times w times its depth, and then resists by toughness '
-        'times w. For an entry at a force F choose w = F / (2.5 toughness): 0.5 mm enters 500 '
-        'J/m^2 at some 0.6 N. 0: it goes in by cut_threshold, and its tip resists by nothing [m], '
-        '0 to 0.01',
+        description='width w of the slit that the tip of the blade opens [m], 0 to 0.01; it goes '
+        'in where the work of the dent reaches toughness times w times its depth, then resists by '
+        'toughness times w. To enter at a force F choose F / (2.5 toughness). 0: it goes in by '
+        'cut_threshold, and its tip resists by nothing',
     )
     method: Literal['given', 'auto'] = Field(
         default='given',

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from bench.accuracy.front import front_table
 from bench.accuracy.measure import Point, measure, reference_cost
 from bench.accuracy.panels import Problem, static_problems
 from bench.accuracy.peer_points import peer_points
@@ -39,28 +38,18 @@ NO_REGION = describe(ActiveSettings(TissueSettings.model_fields['active_region']
 _PAGE = """# Speed against accuracy
 
 Written by `./trainer chart`: every elastic model with every integrator, on problems whose solution
-is known by other means. To the right is slower, upwards is worse; the grey line joins the points
-that no other beats in both. A curve is a model with its cheapest integrator, dashed the error of
-its force; the other integrators are faint. Other packages bend the same beam in a
-[run of their own](performance.md#beside-others). All digits: [points.csv](charts/points.csv).
+is known by other means (named at the axis). Each scene's method is on the front of the panel that
+resembles it (`test/test_chart.py`). [Others](performance.md#beside-others) bend the beam too.
+[All digits](charts/points.csv).
 
-- **CPU time** is that of one thread for one second of simulated time at {safety:g} of the stable
-  step (`safety`). On this machine ({machine}) a force of the linear model took
-  {reference_cost:.1f} ns a tetrahedron, before and after {after:.1f}.
-- **Error** is that of the displacement under the given load, or of the force for the given
-  displacement. It belongs to model and mesh; the integrator matters in free vibration only.
+- **CPU time** is that of one thread at {safety:g} of the stable step. A force of the linear model
+  took {reference_cost:.1f} ns a tetrahedron, and {after:.1f} at the end ({machine}).
+- **Error** belongs to model and mesh; the integrator matters in free vibration only.
 - Damping: alpha {alpha:g} 1/s, beta {beta:g} s (active region: {region_alpha:g} 1/s,
   {region_beta:g} s); none in free vibration, where forward Euler has no stable step. Implicit
   steps last a frame, 33 ms; in free vibration also a 4th and a 16th of it.
 
-{panels}
-## The methods of the scenes
-
-A method is on the front of a panel if no other is faster and as near on any mesh, and if it is on
-the front of all meshes on one of them. As near: no more error in the panel and in free vibration.
-
-{front}
-"""
+{panels}"""
 
 
 def run_chart(folder: Path, *, coarse: bool = False, as_json: bool = False) -> None:
@@ -127,7 +116,6 @@ def write_chart(folder: Path, points: list[Point], yardsticks: tuple[float, floa
         region_alpha=REGION_ALPHA,
         region_beta=REGION_BETA,
         panels='\n'.join(panels),
-        front=front_table(points),
     )
     (folder / 'charts.md').write_text(page, encoding='utf-8')
 
@@ -158,10 +146,7 @@ def region_sentence(points: list[Point]) -> str:
 
 
 def _panel(problem: Problem | Vibration | LocalPalpation) -> str:
-    return (
-        f'## {problem.title}\n\n![Error against CPU time](charts/{problem.name}.png)\n\n'
-        f'Reference: {problem.reference_name}.\n'
-    )
+    return f'## {problem.title}\n\n![Error against CPU time](charts/{problem.name}.png)\n'
 
 
 def sentence(points: list[Point]) -> str:

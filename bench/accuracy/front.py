@@ -99,15 +99,3 @@ def standing(points: list[Point], scene: str, tissue: TissueSettings) -> dict[st
     """Return the reasons why the method of a scene is not on the front, by panel; none: it is."""
     method = (tissue.model, tissue.integrator)
     return {problem: reasons_off_front(points, problem, method) for problem in PANELS[scene]}
-
-
-def front_table(points: list[Point]) -> str:
-    """Return each shipped scene, its method, and where it stands, as a table of the page."""
-    rows = ['| scene | method | panel | on the front |', '|---|---|---|---|']
-    for scene, tissue in scenes().items():
-        for problem, why in standing(points, scene, tissue).items():
-            rows.append(
-                f'| {scene} | {tissue.model} by {tissue.integrator} | '
-                f'[{problem}](charts/{problem}.png) | {"; ".join(why) or "yes"} |'
-            )
-    return '\n'.join(rows)

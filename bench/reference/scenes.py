@@ -19,6 +19,7 @@ from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSe
 from cutting_trainer.node_common.scene_reader import SECTIONS
 from cutting_trainer.node_common.share_folder import PACKAGES
 from cutting_trainer.session.scene_loader import SessionSettings
+from cutting_trainer.tissue_sim.material_presets import PresetName
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MODELS: dict[str, type[BaseModel]] = {
@@ -32,6 +33,16 @@ MODELS: dict[str, type[BaseModel]] = {
 }
 FILE = PACKAGES / 'docs' / 'scenes.md'
 MARK = '<!-- Below: written by `python -m bench.reference.scenes` from the models. -->\n'
+EXPLAINED = {
+    'tissue.material.preset': '[material](materials.md) that fills in the values not given',
+    'tissue.model': '[elastic model](method.md#choose-a-model)',
+    'tissue.contact': '[load of the tool](method.md#contact)',
+    'tissue.integrator': '[integrator](method.md#motion)',
+    'haptics.extrapolation': '[force between two frames](haptics.md#from-pose-to-force)',
+    'haptics.forces': "[tissue's reaction, or force of the spring](haptics.md#two-forces-or-one)",
+    'cutting.method': '[method of cutting](cutting.md)',
+}
+"""Keys whose choices a page explains, and the link to it."""
 _RANGE = re.compile(r', (each |above )?-?[\d.e]+ to (below )?-?[\d.e]*\d')
 
 
@@ -53,14 +64,21 @@ class Key:
 
 
 def reference() -> str:
-    """Return the tables of all sections."""
+    """Return the tables of all sections; keys of the same name and meaning share a row."""
     parts = []
     for section in SECTIONS:
         parts.append(f'## `{section}`\n')
         parts.append('| key | value; default | meaning |\n|---|---|---|')
+        alike: dict[tuple[str, str, str], list[Key]] = {}
         for key in keys(MODELS[section], ''):
-            value = f'{key.value}; {key.default}' if key.default else key.value
-            parts.append(f'| `{key.name}` | {value} | {key.meaning} |')
+            leaf = key.name.rpartition('.')[2]
+            alike.setdefault((leaf, key.value, key.meaning), []).append(key)
+        for same in alike.values():
+            first = same[0]
+            names = ', '.join(f'`{key.name}`' for key in same)
+            meaning = EXPLAINED.get(f'{section}.{first.name}', first.meaning)
+            value = f'{first.value}; {first.default}' if first.default else first.value
+            parts.append(f'| {names} | {value} | {meaning} |')
         parts[-1] += '\n'
     return '\n'.join(parts)
 
@@ -96,12 +114,13 @@ def _meaning(text: str) -> str:
 
 
 def _value(field: FieldInfo, meaning: str) -> str:
+    if field.annotation == PresetName | None:
+        return 'name'
     kinds = [kind for kind in _alternatives(field.annotation) if kind is not type(None)]
     (kind,) = kinds
     if get_origin(kind) is Literal:
         choices = get_args(kind)
-        explained = all(f'{choice}: ' in meaning for choice in choices)
-        return 'choice' if explained else ', '.join(f'`{choice}`' for choice in choices)
+        return ', '.join(f'`{choice}`' for choice in choices)
     if get_origin(kind) is tuple:
         item = get_args(kind)[0]
         if item is str:

@@ -200,11 +200,23 @@ def reference() -> str:
         by = f'{t.by}, {t.when}' if t.when else t.by
         cells = (f'`{t.name}`', _type(t.type), depth, by, t.content)
         parts.append(f'| {" | ".join(cells)} |')
-    parts += ['\n## Services\n', '| service | type | from | content |', '|---' * 4 + '|']
-    parts += [f'| `{n}` | {_type(kind)} | {by} | {content} |' for n, kind, by, content in SERVICES]
+    parts += ['\n## Services\n', '| service | type | content |', '|---' * 3 + '|']
+    parts += _services()
     parts.append('')
     parts += [_interface(file) for file in interface_files()]
     return '\n'.join(parts)
+
+
+def _services() -> list[str]:
+    """Return the rows of the services; those that differ by their server only share one."""
+    servers: dict[tuple[str, str, str], list[str]] = {}
+    for name, kind, by, content in SERVICES:
+        alike = (name.removeprefix(f'{by}/'), kind, content)
+        servers.setdefault(alike, []).append(f'`{name}`')
+    return [
+        f'| {", ".join(names)} | {_type(kind)} | {content} |'
+        for (_, kind, content), names in servers.items()
+    ]
 
 
 def describe(qos: QoSProfile) -> str:

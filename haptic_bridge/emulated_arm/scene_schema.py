@@ -117,7 +117,7 @@ class ArmSettings(SceneModel):
     )
     hand: HandSettings = HandSettings()
     script: ScriptSettings | None = Field(
-        None, description='path of the emulated arm; none: only a real arm moves the tool'
+        None, description='of the emulated arm; none: only a real arm moves the tool'
     )
 
     def require_script(self) -> ScriptSettings:
