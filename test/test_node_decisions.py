@@ -141,7 +141,7 @@ def cutting(revision: int) -> Any:
     replica = MeshReplica()
     replica.load(message)
     settings, asked = CuttingSettings(), []
-    node = SimpleNamespace(
+    return SimpleNamespace(
         _settings=settings,
         _method=make_method(settings),
         _replica=replica,
@@ -153,7 +153,6 @@ def cutting(revision: int) -> Any:
         _rebuild=asked.append,
         asked=asked,
     )
-    return node
 
 
 def answer(node: Any, **request: Any) -> tuple[int, str]:

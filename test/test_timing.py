@@ -1,4 +1,4 @@
-"""Statistics of a periodic loop for wake-ups worked out by hand, and who is asked for preference."""
+"""Statistics of a loop for wake-ups worked out by hand, and which threads ask for preference."""
 
 import threading
 
