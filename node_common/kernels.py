@@ -7,12 +7,15 @@ from collections.abc import Callable
 from typing import Any
 
 from numba import njit
-from numba.extending import register_jitable
+from numba.extending import overload, register_jitable
+from numba.np import arrayobj
+
+_OPTIONS = {'cache': True, 'no_cfunc_wrapper': True}
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function that Python calls, with options of `numba.njit`."""
-    compiled = njit(cache=True, no_cfunc_wrapper=True, **options)
+    compiled = njit(**_OPTIONS | options)
     return compiled if function is None else compiled(function)
 
 
@@ -21,5 +24,22 @@ def inner(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
     Half of a small kernel's compile time is the wrapper by which Python calls it: it has none.
     """
-    compiled = register_jitable(cache=True, no_cfunc_wrapper=True, **options)
+    compiled = register_jitable(**_OPTIONS | options)
     return compiled if function is None else compiled(function)
+
+
+def _raise_for_shape(source: Any, target: Any) -> None:
+    """Raise for an array that is copied to a slice of another shape."""
+
+
+@overload(_raise_for_shape)
+def _raise_in_kernel(source: Any, target: Any) -> Callable[..., None]:
+    def raise_error(source: Any, target: Any) -> None:
+        raise ValueError('an array is copied to a slice of another shape')
+
+    return raise_error
+
+
+# The sentence that Numba puts together for it, with both shapes, took a seventh of the time in
+# which the force loop is compiled.
+arrayobj.raise_with_shape_context = _raise_for_shape

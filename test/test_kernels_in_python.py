@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cutting_trainer.node_common.kernels import kernel
+
 pytestmark = pytest.mark.long
 
 TEST = Path(__file__).parent
@@ -35,3 +37,16 @@ def test_kernels_in_python_come_to_what_the_compiled_ones_do_but_for_rounding() 
         assert np.abs(values).max() > 1e-4
         np.testing.assert_allclose(python[name], values, rtol=1e-9, atol=1e-12, err_msg=name)
     assert compiled['elements cut'] > 0
+
+
+def test_a_copy_to_a_slice_of_another_shape_is_an_error_without_the_shapes() -> None:
+    """Numba's own sentence would bring its functions of text into each kernel that copies so."""
+
+    def copy(target: np.ndarray, source: np.ndarray) -> None:
+        target[:] = source
+
+    copied, target = kernel(copy, cache=False), np.zeros(3)
+    copied(target, np.arange(3.0))
+    np.testing.assert_array_equal(target, np.arange(3.0))
+    with pytest.raises(ValueError, match='to a slice of another shape'):
+        copied(target, np.zeros(2))

@@ -22,6 +22,7 @@ from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.streaming import link_budget
 from cutting_trainer.tissue_sim.streaming.link_budget import LinkBudget
 from cutting_trainer.tissue_sim.streaming.messages import mesh_message
 from cutting_trainer.viewer.operator_commands import known_state
@@ -50,15 +51,15 @@ def test_a_state_that_is_none_of_crtks_is_unknown() -> None:
 
 
 def test_a_link_that_has_sent_all_it_may_holds_the_next_message_back() -> None:
-    link = LinkBudget(1000.0)
-    assert link.allows(1.0)
-    link.spend(GetMesh.Response().mesh)
-    mesh = mesh_message(TetMesh(*box((1, 1, 1), 0.01)), np.zeros((8, 3)), '', 0, 0, 0)
-    link.spend(mesh)
-    assert link.sent > 0
-    link._left = 0.0
-    assert not link.allows(1.0) and link.held_back == 1
-    assert link.allows(1.001)
+    message = mesh_message(TetMesh(*box((1, 1, 1), 0.01)), np.zeros((8, 3)), '', 0, 0, 0)
+    probe = LinkBudget(1.0)
+    probe.spend(message)
+    burst = probe.sent
+    link = LinkBudget(burst / link_budget._BURST_S)
+    assert link.allows(1.0) and link.allows(1000.0)
+    link.spend(message)
+    assert not link.allows(1000.0) and link.held_back == 1, 'a pause saves up one burst at most'
+    assert link.allows(1000.001)
 
 
 def test_the_times_of_a_bag_are_those_of_its_earliest_and_latest_message() -> None:
@@ -141,7 +142,7 @@ def cutting(revision: int) -> Any:
     replica = MeshReplica()
     replica.load(message)
     settings, asked = CuttingSettings(), []
-    node = SimpleNamespace(
+    return SimpleNamespace(
         _settings=settings,
         _method=make_method(settings),
         _replica=replica,
@@ -153,7 +154,6 @@ def cutting(revision: int) -> Any:
         _rebuild=asked.append,
         asked=asked,
     )
-    return node
 
 
 def answer(node: Any, **request: Any) -> tuple[int, str]:
@@ -190,8 +190,27 @@ def test_a_new_simulation_gets_the_tissue_with_the_cut_that_was_answered_last() 
     assert (mesh.revision, len(mesh.rest), len(mesh.displacement)) == (7, 3 * count, 3 * count)
     node._replica.topology += 1
     node._ahead = np.full((count + 5, 3), 0.5)
+    node._method = SimpleNamespace(abort=lambda: node.asked.append('abort'))
     mesh = CuttingNode._serve_mesh(node, None, GetMesh.Response()).mesh
     assert mesh.revision == 8
     np.testing.assert_array_equal(mesh.displacement, np.full(3 * count, 0.5))
+    assert node.asked == ['abort'], 'the stroke is not known to it'
     node._mesh = None
     assert not CuttingNode._serve_mesh(node, None, GetMesh.Response()).success
+
+
+def test_nodes_that_a_cut_makes_are_ahead_where_the_tissue_is_displaced_to() -> None:
+    node = cutting(7)
+    stretch = np.array([0.02, -0.01, 0.03])
+    node._displacements[-1] = (7, node._mesh.rest * stretch)
+    count = node._mesh.node_count
+    way = {
+        'root_from': [-0.01, 0.011, 0.03],
+        'tip_from': [-0.01, 0.011, -0.01],
+        'root_to': [0.03, 0.011, 0.03],
+        'tip_to': [0.03, 0.011, -0.01],
+    }
+    assert answer(node, command=0, **way)[0] == Cut.Response.OK
+    assert node._mesh.node_count > count
+    ahead = node._ahead[: node._mesh.node_count]
+    np.testing.assert_allclose(ahead, node._mesh.rest * stretch, atol=1e-12)

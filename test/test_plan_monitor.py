@@ -73,9 +73,11 @@ def test_a_plan_of_an_earlier_start_is_taken_and_a_new_one_kept(
     kept: list[Plan] = []
     monkeypatch.setattr(assembly, 'recall', lambda *_: known[0])
     monkeypatch.setattr(assembly, 'remember', lambda _, found: kept.append(found))
-    monkeypatch.setattr(assembly, 'plan', lambda *_: PLAN)
-    monkeypatch.setattr(assembly, 'warm_up', lambda: None)
+    done: list[str] = []
+    monkeypatch.setattr(assembly, 'plan', lambda *_: done.append('measure') or PLAN)
+    monkeypatch.setattr(assembly, 'warm_up', lambda: done.append('load'))
     task: Any = None
     assert assembly.make_plan(task) is PLAN and kept == [PLAN]
+    assert done == ['load', 'measure'], 'what is loaded meanwhile would count as cost'
     known[0] = replace(PLAN, available=0.01)
     assert assembly.make_plan(task) is known[0] and kept == [PLAN]
