@@ -111,8 +111,10 @@ class CombinedMethod:
         if finish or folded:
             self._round_off(mesh, positions)
         active = self._active[:0] if finish or folded else self._active
-        settle_waiting(active, self._stroke(mesh, positions), self._scheme.subdivides)
-        batch = build_batch(mesh, positions, self._tables, active, self._scheme, self._limits())
+        stroke = self._stroke(mesh, positions)
+        waiting = settle_waiting(active, stroke, self._scheme.subdivides)
+        held = np.concatenate([active, np.repeat(waiting[:, None], 4, axis=1)])
+        batch = build_batch(mesh, positions, self._tables, held, self._scheme, self._limits())
         self._tables = batch.tables
         delta, area = batch.delta, batch.report.area
         if folded:

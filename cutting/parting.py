@@ -224,9 +224,8 @@ def local_elements(
     rest[:first_new] = mesh.rest[nodes[:first_new]]
     new = nodes[first_new:] - mesh.node_count
     rest[first_new:] = interpolated(mesh.rest, delta.node_parents[new], delta.node_weights[new])
-    at = np.searchsorted(nodes, delta.moved_nodes)
-    here = np.flatnonzero(nodes[at.clip(max=len(nodes) - 1)] == delta.moved_nodes)
-    rest[at[here]] = interpolated(mesh.rest, delta.moved_parents[here], delta.moved_weights[here])
+    _, at, here = np.intersect1d(nodes, delta.moved_nodes, return_indices=True)
+    rest[at] = interpolated(mesh.rest, delta.moved_parents[here], delta.moved_weights[here])
     return Local(nodes, rest, corners, number, _match(corners, len(nodes)))
 
 

@@ -15,6 +15,8 @@ _MIN_EDGE_SINE = 1e-5
 """Smallest sine between the triangles at an edge of the tissue; less is rounding."""
 _SMOOTH = 0.8
 """Smallest cosine between the triangles at a node and the tangent plane of the surface there."""
+_PASSES = 4
+"""Times that nodes which could not slide try again."""
 _BEYOND = -0.3
 """Smallest weight of a node of the tetrahedron into which a node slides."""
 
@@ -388,24 +390,31 @@ def slides(rows, links, tables, rest, fixed, limits):
     at[-1] = 0
     count = 0
     way, target = np.empty(3), np.empty(3)
-    for row in rows:
-        plane = tables.rest_plane[row]
-        if plane[3] == 0.0:
-            continue
-        node = tables.node_id[row]
-        star = incident_tetrahedra(node, links, tables)
-        if not find_slide(star, plane, links, rest, fixed, limits.shape, at, where, at, way):
-            continue
-        nodes, weights = tables.slide_to[row], tables.slide[row]
-        if not _express(node, rest[node] + way, links, rest, nodes, weights):
-            continue
-        for i in range(3):
-            target[i] = 0.0
-            for k in range(4):
-                target[i] += weights[k] * rest[nodes[k], i]
-        if stays_sound(star, target, rest, limits.floor, at, where):
-            moved[count] = row
-            where[count] = target
-            at[node] = count
-            count += 1
+    stays = np.ones(len(rows), np.bool_)
+    for _ in range(_PASSES):  # each makes room for its neighbours
+        before = count
+        for k in range(len(rows)):
+            row = rows[k]
+            plane = tables.rest_plane[row]
+            if not stays[k] or plane[3] == 0.0:
+                continue
+            node = tables.node_id[row]
+            star = incident_tetrahedra(node, links, tables)
+            if not find_slide(star, plane, links, rest, fixed, limits.shape, at, where, at, way):
+                continue
+            nodes, weights = tables.slide_to[row], tables.slide[row]
+            if not _express(node, rest[node] + way, links, rest, nodes, weights):
+                continue
+            for i in range(3):
+                target[i] = 0.0
+                for j in range(4):
+                    target[i] += weights[j] * rest[nodes[j], i]
+            if stays_sound(star, target, rest, limits.floor, at, where):
+                moved[count] = row
+                where[count] = target
+                at[node] = count
+                count += 1
+                stays[k] = False
+        if count == before:
+            break
     return moved[:count], where[:count]

@@ -20,7 +20,8 @@ from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free
 from bench.cuts.strokes import good_block
 from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.cutting.cut_invariants import check_area, check_mesh, cut_face_area
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.cutting.parting import local_elements
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 
 pytestmark = pytest.mark.long
 
@@ -214,3 +215,16 @@ def test_a_swept_area_that_stays_closed_is_said_and_nothing_else_is():
             assert not said or share < 0.8
             closed += said
     assert closed > 0
+
+
+def test_ends_of_strokes_that_meet_beside_the_tissue_part_nothing(plate):
+    """The last batch of a stroke may only move nodes, none of them near where two ends meet."""
+    mesh = TetMesh(plate.nodes, plate.tetrahedra)
+    node = int(np.argmin(np.linalg.norm(mesh.rest - plate.middle, axis=1)))
+    stays = np.array([[node] * 4]), np.array([[1.0, 0.0, 0.0, 0.0]])
+    delta = TopologyDelta(
+        moved_nodes=np.array([node]), moved_parents=stays[0], moved_weights=stays[1]
+    )
+    far = plate.nodes.max(axis=0) + np.array([[0.05, 0.0, 0.0], [0.05, 0.0, 0.01]])
+    local = local_elements(mesh, delta, np.zeros(0, np.int64), far, 0.001, 1)
+    assert len(local.corners) == 0
