@@ -45,9 +45,9 @@ class ToolSettings(SceneModel):
     )
     mode: Literal['scalpel', 'palpator', 'open_grasper', 'closed_grasper'] = Field(
         'scalpel',
-        description='mode at first: a palpator never goes in, a closed grasper holds the tissue that '
-        'it has closed on. The parameter `tool_mode` of haptic_bridge, or `device.mode_button`, '
-        'changes it',
+        description='mode at first: a palpator never goes in, a closed grasper holds the tissue '
+        'that it has closed on. The parameter `tool_mode` of haptic_bridge, or '
+        '`device.mode_button`, changes it',
     )
 
     @model_validator(mode='after')

@@ -12,7 +12,7 @@ from test_blade import contact_at
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
-from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling, Tool
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, PUSH, Coupling, Tool
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -291,3 +291,30 @@ def test_a_loose_piece_that_is_pushed_away_stops_and_the_rest_goes_on(
     assert not dynamics.velocity[free].any()
     assert not np.ptp(dynamics.displacement[free], axis=0).any()  # it has its shape at rest
     assert count == 40 * motion.substeps
+
+
+class _Entering:
+    """A tool that from the second quarter of a frame on holds one light node."""
+
+    parts = 4
+
+    def __init__(self, node: int, place: np.ndarray, stiffness: float) -> None:
+        self._held = Coupling(HOLD, np.array([node]), np.ones(1), place, place, stiffness=stiffness)
+
+    def restart(self) -> Coupling:
+        return Coupling()
+
+    def after(self, share: float, positions: np.ndarray) -> Coupling:
+        return self._held
+
+
+def test_the_step_follows_a_spring_that_is_new_within_a_frame() -> None:
+    tissue = simulation(integrator='symplectic_euler').dynamics
+    node = int(np.flatnonzero(tissue.mesh.fixed == 0)[0])
+    stiffness = 3.0 * tissue.omega**2 * float(tissue.model.mass[node])
+    place = tissue.mesh.rest[node] + [0.0, 0.0, 1e-5]
+    calm = tissue.advance(Coupling())
+    motion = tissue.advance(Coupling(), _Entering(node, place, stiffness))
+    assert motion.trouble == ''
+    assert calm.substeps < motion.substeps <= 4 * calm.substeps
+    assert motion.slow_motion == pytest.approx(1.0)

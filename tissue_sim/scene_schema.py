@@ -238,10 +238,10 @@ class Integration(SceneModel):
     )
     frequency_growth: float = Field(
         default=3.0,
-        ge=1,
+        ge=0.3,
         le=1000,
-        description='how far cuts may raise the highest frequency before small nodes get more mass '
-        '[-], 1 to 1000',
+        description='how far cuts may raise the highest frequency before small nodes get more '
+        'mass; below 1 those of the mesh do too, for longer steps [-], 0.3 to 1000',
     )
     min_substeps: int = Field(
         default=1,

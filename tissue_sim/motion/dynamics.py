@@ -16,6 +16,7 @@ from cutting_trainer.tissue_sim.contact.coupling import (
 from cutting_trainer.tissue_sim.contact.cut_contact import NO_CUT_CONTACTS, CutContact, CutContacts
 from cutting_trainer.tissue_sim.contact.cut_contact_search import NO_NEAR_FACES, NearFaces
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
+from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.adjacency import spans_of
@@ -39,7 +40,7 @@ from cutting_trainer.tissue_sim.motion.far_field import FarField
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
 from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
 from cutting_trainer.tissue_sim.motion.loads import Loads
-from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
+from cutting_trainer.tissue_sim.motion.stability import ALL_ITERATIONS, FrequencyBound, step_bound
 from cutting_trainer.tissue_sim.motion.stiffened_mass import SUBSTEPS_BETWEEN, StiffenedMass
 
 _AT_REST = 1e-9
@@ -67,7 +68,8 @@ class TimeStepping:
         min_substeps, max_substeps: of a frame; when the largest number does not suffice the frame
             simulates less time than it lasts.
         frequency_growth: largest growth of the highest frequency by cuts before small nodes are
-            integrated with more mass (see `FrequencyBound`); infinite: no limit.
+            integrated with more mass (see `FrequencyBound`); infinite: no limit. Below 1, those of
+            the mesh are too.
     """
 
     integrator: IntegratorName = 'rk4'
@@ -122,11 +124,15 @@ class Dynamics:
         self._inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / self.model.mass), 3)
         self._inertia = self.model.mass.copy()
         self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
+        growth, unscaled = self.stepping.frequency_growth, self._frequency.unscaled
+        if growth < 1.0:
+            self._inertia[:] = self._frequency.slow_down()
+            self._inverse[:] = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / self._inertia), 3)
+            self._frequency.refine(ALL_ITERATIONS)
         self._uncut = self._frequency.omega
         self._stiffened: StiffenedMass | None = None
         if self.model.lawful:
-            growth = self.stepping.frequency_growth
-            self._stiffened = StiffenedMass(self.model, self._uncut, mesh.fixed == 0, growth)
+            self._stiffened = StiffenedMass(self.model, unscaled, mesh.fixed == 0, growth)
         self._bounds: dict[float, float] = {}
         self._still = 0
         self._elastic = ElasticState(self.model)
@@ -195,6 +201,11 @@ class Dynamics:
         middle = self.mesh.rest[fixed].mean(axis=0)
         u = self.displacement
         u[:] = (self.mesh.rest - middle) * stretch
+        if self.model.lawful:
+            # Steps with the linear stiffness diverge where the law counts.
+            u[:] = equilibrium(self.model, np.zeros_like(u), start=u, tolerance=1e-9)
+            self.restart()
+            return
         first = 0.0
         for _ in range(50 if self.model.rotating else 1):
             residual = -self.model.force(u)
@@ -264,8 +275,9 @@ class Dynamics:
         relieved = None if self.loads is None else self.loads.kept()
         trouble = ''
         while True:
-            work, contacts = self._integrate(couplings, dt, substeps, tools)
-            motion = self._motion(dt, substeps, trouble, contacts)
+            work, contacts, taken = self._integrate(couplings, dt, substeps, tools)
+            slow = dt * substeps / self._frame_time
+            motion = self._motion(slow, taken, trouble, contacts)
             energy = motion.kinetic_energy + motion.elastic_energy
             found = self._detector.diagnose(self.displacement, energy, work)
             if not found:
@@ -352,10 +364,23 @@ class Dynamics:
         met = contacts.nodes.ravel(), pressed
         return self._active.choose(*at, held_nodes(couplings), self._frame_time, met)
 
+    def _finer(self, couplings: Sequence[Coupling], dt: float) -> int:
+        """Return into how many parts a step must be split for a spring that is new in the frame.
+
+        A blade that enters holds fewer nodes than the tool did when the step was chosen: where they
+        are light, the frequency of the spring is above that of the tissue.
+        """
+        bound = self.bound(couplings)
+        if dt <= bound or bound == 0.0:
+            return 1
+        return min(int(np.ceil(dt / (self.stepping.safety * bound))), _FINEST)
+
     def _integrate(
         self, couplings: Sequence[Coupling], dt: float, substeps: int, tools: Sequence[Tool]
-    ) -> tuple[float, NearFaces]:
-        """Move the tissue by a frame; return the work of the tools [J], and what is in contact."""
+    ) -> tuple[float, NearFaces, int]:
+        """Move the tissue by a frame; return the work of the tools [J], what is in contact, and the
+        number of substeps.
+        """
         size = 3 * self.mesh.node_count
         moving = self._state()[1][:size]
         calm = self.loads is None or self.loads.settled
@@ -363,7 +388,7 @@ class Dynamics:
             # Decay would continue into denormal numbers, at a hundred times the cost.
             if self._still >= _STILL_FRAMES:
                 moving[:] = 0.0
-                return 0.0, NO_NEAR_FACES
+                return 0.0, NO_NEAR_FACES, substeps
             self._still += 1
         else:
             self._still = 0
@@ -413,6 +438,10 @@ class Dynamics:
                 positions = self.positions
                 couplings = [tool.after(done / substeps, positions) for tool in tools]
                 springs = springs_of(couplings, self.mesh.rest)
+                finer = self._finer(couplings, dt)
+                if finer > 1:
+                    done, substeps, dt = finer * done, finer * substeps, dt / finer
+                    look, adapt = finer * look, finer * adapt
                 if self._far is not None and not self._far.covers(couplings):
                     self._far.follow(*self._state(), size)
                     self._elastic.whole(self.displacement)
@@ -421,7 +450,7 @@ class Dynamics:
             self._far.follow(*self._state(), size)
         if faces is not None:
             self.cut_contact.keep(contacts, faces)
-        return work, contacts
+        return work, contacts, substeps
 
     def _meeting(self, contacts: NearFaces, region: Region) -> CutContacts:
         """Return contacts as the operand of the region's kernels."""
@@ -481,13 +510,12 @@ class Dynamics:
         stiffened, base = self._stiffened, self.inverse_mass
         return base if stiffened is None else stiffened.inverse(base)
 
-    def _motion(self, dt: float, substeps: int, trouble: str, contacts: NearFaces) -> FrameMotion:
+    def _motion(self, slow: float, substeps: int, trouble: str, contacts: NearFaces) -> FrameMotion:
         force, elastic = self._elastic_now()
         if len(contacts.nodes):
             force = force - self.cut_contact.force(contacts, *self._state())
         elastic += self._load_energy()
         kinetic = self._kinetic_energy()
-        slow = dt * substeps / self._frame_time
         strain = None if self._stiffened is None else self._stiffened.strain
         return FrameMotion(force, kinetic, elastic, substeps, slow, trouble, strain=strain)
 

@@ -39,6 +39,10 @@ def _power_iterations(operands, spans, inverse_mass, x, f, steps):
     return quotient
 
 
+ALL_ITERATIONS = 48
+"""Power iterations after which a bound has converged."""
+
+
 class FrequencyBound:
     """Upper bound of the highest natural frequency of a tissue under cuts.
 
@@ -55,11 +59,11 @@ class FrequencyBound:
     Args:
         model: the elastic model.
         inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
-        growth: the ceiling, as a multiple of the bound at the start.
+        growth: the ceiling, as a multiple of the bound at the start. Below 1, small elements of the
+            mesh itself get more mass too: see `slow_down`.
     """
 
     MARGIN = 1.03
-    _ENOUGH = 48
 
     def __init__(
         self, model: ElasticModel, inverse_mass: np.ndarray, growth: float = np.inf
@@ -74,8 +78,27 @@ class FrequencyBound:
         self._cut: list[np.ndarray] = []
         self._f = np.zeros(0)
         self.update(np.arange(model.mesh.node_count), inverse_mass)
-        self.refine(self._ENOUGH)
+        self.refine(ALL_ITERATIONS)
+        self._unscaled = self._settled
         self._ceiling = growth * self._settled
+
+    @property
+    def unscaled(self) -> float:
+        """Bound of the frequency at the start, without added mass [rad/s]."""
+        return self._unscaled
+
+    def slow_down(self) -> np.ndarray:
+        """Return masses with which the nodes of a mesh are no faster than the ceiling [kg],
+        shape (n,).
+
+        Rows are scaled so that the worst has the frequency that the iterations found; the caller
+        gives the masses to `inverse_mass` and calls `refine` for the frequency that they leave.
+        """
+        self._done = 0
+        self._cut = [np.arange(self._model.mesh.node_count)]
+        mass, worst = self._model.mass, np.sqrt(self._rows[self._inverse_mass[::3] > 0.0].max())
+        share = self._rows * (self._unscaled / (self._ceiling * worst)) ** 2
+        return np.asarray(mass * np.maximum(1.0, share))
 
     def update(self, nodes: np.ndarray, inverse_mass: np.ndarray) -> None:
         """Register the rows touched by a change of connectivity.
@@ -119,7 +142,7 @@ class FrequencyBound:
         Args:
             steps: number of iterations.
         """
-        if self._done >= self._ENOUGH:
+        if self._done >= ALL_ITERATIONS:
             return
         if self._done == 0:
             self._look_around()
@@ -136,7 +159,7 @@ class FrequencyBound:
             steps,
         )
         self._done += steps
-        if self._done >= self._ENOUGH:
+        if self._done >= ALL_ITERATIONS:
             found = self.MARGIN * float(np.sqrt(max(square, 0.0)))
             self._settled = max(found, self._settled) if some else found
             self._provisional = 0.0
