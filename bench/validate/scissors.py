@@ -1,9 +1,9 @@
 """Torque of scissors by their opening angle: one blade closes on a sheet that the other supports.
 
 The edge is straight and passes the pivot at a distance e. At an angle a to the sheet, it crosses
-the layer at a depth d of the sheet at x = (e - d cos a) / sin a from the pivot. As the scissors close,
-the crossing moves outward, and the sheet is cut progressively. Without friction, the torque is
-toughness times the area A by angle (Mahvash et al. 2008):
+the layer at a depth d of the sheet at x = (e - d cos a) / sin a from the pivot. As the scissors
+close, the crossing moves outward, and the sheet is cut progressively. Without friction, the torque
+is toughness times the area A by angle (Mahvash et al. 2008):
 
     T = J |dA/da|, A = t (e - t / 2 cos a) / sin a for rigid scissors
 
