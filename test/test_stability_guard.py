@@ -314,7 +314,7 @@ def test_the_step_follows_a_spring_that_is_new_within_a_frame() -> None:
     stiffness = 3.0 * tissue.omega**2 * float(tissue.model.mass[node])
     place = tissue.mesh.rest[node] + [0.0, 0.0, 1e-5]
     calm = tissue.advance(Coupling())
-    motion = tissue.advance(Coupling(), _Entering(node, place, stiffness))
+    motion = tissue.advance(Coupling(), tools=[_Entering(node, place, stiffness)])
     assert motion.trouble == ''
     assert calm.substeps < motion.substeps <= 4 * calm.substeps
     assert motion.slow_motion == pytest.approx(1.0)
