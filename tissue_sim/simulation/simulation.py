@@ -169,11 +169,14 @@ class TissueSimulation:
         command, sweep = self._decide(contact, coupling)
         force = self._reaction(coupling, motion)
         outside = contact if self._blade is None else None
+        stiffness = self._stiffness.matrix(coupling, outside, self._moved, force)
+        if self._blade is not None:
+            self._blade.note_stiffness(stiffness)
         return replace(
             frame,
             state=self.state,
             force=force,
-            stiffness=self._stiffness.matrix(coupling, outside, self._moved, force),
+            stiffness=stiffness,
             resistance=self._blade.limit if self._blade else 0.0,
             turning=self._blade.turning if self._blade else NOT_TURNED,
             command=command,
