@@ -1,8 +1,8 @@
 """Kernels of a crack that runs in steps, so that the force on the blade is a sawtooth.
 
 Soft tissue is cut in turns of deformation and sudden growth of the crack. The edge stays while the
-force on it is below F + k a / 2: F is the yield force of a steady edge, k the stiffness of tissue and
-coupling along the push, a the length of a step. It then goes on by a and bears F - k a / 2
+force on it is below F + k a / 2: F is the yield force of a steady edge, k the stiffness of tissue
+and coupling along the push, a the length of a step. It then goes on by a and bears F - k a / 2
 meanwhile, down to which the force falls as it goes. On a linear spring, the hand moves on by a from
 tooth to tooth against F in the mean, so that a tooth costs F a: toughness times its area.
 """
