@@ -15,6 +15,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     ToolSettings,
 )
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
 
 NONE, TOUCHING, INSIDE = range(3)
 """Contact states, as in `Contact`."""
@@ -49,6 +50,7 @@ SETUP = record_type(
         ('max_force', 'f8'),  # [N]
         ('max_slew', 'f8'),  # [N/s]
         ('length', 'f8'),  # [m] of the blade, in the tissue
+        ('steps', 'f8', (2,)),  # of a crack [m], 0: none, and friction on the blade [N/m]
         ('hand_length', 'f8'),  # [m] the same at the hand; 0: the device renders no torque
         ('max_torque', 'f8'),  # [N m]
         ('body_frame', 'i8'),
@@ -74,6 +76,7 @@ STATE = record_type(
         ('held', 'f8'),  # [N] largest force that can hold the blade
         ('reach', 'f8'),  # share of the resistance that a blade so far from the surface may feel
         ('edge', 'f8', (2, 3)),  # [m] the blade of the last tick
+        ('advanced', 'f8', (3,)),  # [m] the edge by steps of a crack since the newest sample
         ('stick', friction.STICK, (1,)),
         ('energy', 'f8'),  # [J] of the passivity observer
         ('damping', 'f8'),  # [N s/m] of the passivity controller
@@ -85,7 +88,11 @@ STATE = record_type(
 
 
 def make_setup(
-    tool: ToolSettings, device: DeviceSettings, haptics: HapticsSettings, profile: DeviceProfile
+    tool: ToolSettings,
+    device: DeviceSettings,
+    haptics: HapticsSettings,
+    profile: DeviceProfile,
+    steps: Steps = NO_STEPS,
 ) -> np.ndarray:
     """Return the constants of a session for the kernels: dtype SETUP, shape (1,)."""
     frame = device.tissue_from_device
@@ -111,6 +118,7 @@ def make_setup(
     length = math.dist(tool.blade_root, tool.blade_tip)
     setup['length'], setup['max_torque'] = length, profile.max_torque
     setup['hand_length'] = length / frame.scale if profile.max_torque > 0.0 else 0.0
+    setup['steps'] = steps
     setup['body_frame'] = device.force_frame == 'body'
     return setup
 
@@ -208,6 +216,8 @@ def _tissue_force(
         extrapolation.estimate(
             c.law, history, time, s.tip, depth, touching, s.arms, c.max_stiffness, out, torque
         )
+        if c.steps[0] > 0.0 and c.law == extrapolation.LOCAL_STIFFNESS and not touching:
+            _run_in_steps(setup, state, history, time, out, torque)
     elif contact == TOUCHING:
         for k in range(3):
             out[k] = -s.external[k]  # until the tissue has answered
@@ -229,6 +239,29 @@ def _tissue_force(
         torque[0] += s.arms[1, 1] * out[2] - s.arms[1, 2] * out[1]
         torque[1] += s.arms[1, 2] * out[0] - s.arms[1, 0] * out[2]
         torque[2] += s.arms[1, 0] * out[1] - s.arms[1, 1] * out[0]
+
+
+@inner
+def _run_in_steps(
+    setup: np.ndarray,
+    state: np.ndarray,
+    history: np.ndarray,
+    time: int,
+    out: np.ndarray,
+    torque: np.ndarray,
+) -> None:
+    """Compute force and torque of a blade before which a crack runs in steps.
+
+    A sample has the steps up to its own time. Since then, the edge goes on here.
+    """
+    c, s = setup[0], state[0]
+    arms, most, none = s.arms, c.max_stiffness, np.zeros(3)
+    for _ in range(2):
+        at = s.tip - s.advanced
+        extrapolation.estimate(c.law, history, time, at, none, False, arms, most, out, torque)
+        limit = s.resistance
+        if not extrapolation.step_ahead(out, history, limit, c.steps, c.length, most, s.advanced):
+            return
 
 
 @inner

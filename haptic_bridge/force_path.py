@@ -32,6 +32,7 @@ from cutting_trainer.haptic_bridge.tissue_sample import TissueSample
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.node_common.rejections import MessageError, RejectionStatistics
+from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import MAX_PULL_N, ToolMode
 
@@ -63,6 +64,7 @@ class ForcePath:
         refusals: rejection statistics to count in; None: its own.
         edge_resistance: largest cutting resistance of the tissue by blade length [N/m].
         friction: of the tool on the tissue.
+        steps: in which a crack runs before the blade.
 
     Attributes:
         stale_trips: how often the simulation's data went stale while enabled.
@@ -85,6 +87,7 @@ class ForcePath:
         rejections: RejectionStatistics | None = None,
         edge_resistance: float = math.inf,
         friction: Friction = NO_FRICTION,
+        steps: Steps = NO_STEPS,
     ) -> None:
         check_together(tool, device, haptics, profile)
         self.haptics = haptics
@@ -94,7 +97,8 @@ class ForcePath:
         self.contact_time = 0.0
         self.max_force = 0.0
         self.mode = self.next_mode = ToolMode[tool.mode.upper()]
-        self._setup = force_kernels.make_setup(tool, device, haptics, profile)
+        self._steps = steps
+        self._setup = force_kernels.make_setup(tool, device, haptics, profile, steps)
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
         names = ('force', 'wrench', 'tip', 'blade', 'arms')
@@ -106,6 +110,7 @@ class ForcePath:
         if any(tool.blade_facing):  # spine and flat do not cut: they stretch the coupling
             edge_resistance = max(edge_resistance, tool.coupling_stiffness)
         self._max_resistance = edge_resistance * self._length
+        self._max_resistance += tool.coupling_stiffness * steps.length / 2
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._grips = friction.sliding > 0.0
         self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
@@ -136,7 +141,7 @@ class ForcePath:
         """
         self.haptics = self.check_scale(force_scale)
         self._setup = force_kernels.make_setup(
-            self._tool, self._device, self.haptics, self._profile
+            self._tool, self._device, self.haptics, self._profile, self._steps
         )
 
     def check_scale(self, force_scale: float) -> HapticsSettings:
@@ -300,6 +305,7 @@ class ForcePath:
         self._s['torque_resistance'] = min(
             reaction.torque_resistance, self._max_resistance * self._length
         )
+        self._s['advanced'] = 0.0
         if reaction.state == INSIDE:
             held = max(math.hypot(*reaction.force), math.hypot(*reaction.torque) / self._length)
             self._s['held'] = min(self._s['held'], held + float(self._setup['slack'][0]))

@@ -46,6 +46,7 @@ from cutting_trainer.node_common.realtime import prepare, run_real_time
 from cutting_trainer.node_common.scene_reader import read_section
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
+from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
@@ -98,10 +99,10 @@ class HapticBridge(ManagedNode):
         tool = read_section(scene, 'tool', ToolSettings)
         haptics = read_section(scene, 'haptics', HapticsSettings)
         profile = device.load_profile()
-        resistance, friction = of_tissue(scene)
+        resistance, friction, steps = of_tissue(scene)
         warm_up(tool, device, haptics, profile, friction)
         self._path = ForcePath(
-            tool, device, haptics, profile, self.rejections, resistance, friction
+            tool, device, haptics, profile, self.rejections, resistance, friction, steps
         )
         self._machine.start_anew()
         self._auto_enable = AutoEnable(self._machine, wanted=wanted)
@@ -384,18 +385,18 @@ def mode_of(name: object) -> ToolMode:
     return MODES[str(name)]
 
 
-def of_tissue(scene: Path) -> tuple[float, Friction]:
+def of_tissue(scene: Path) -> tuple[float, Friction, Steps]:
     """Return the largest cutting resistance of the tissue by blade length [N/m], inf if it is
-    unknown, and its friction.
+    unknown, its friction, and the steps in which it is cut.
     """
     try:
         tissue = read_section(scene, 'tissue', TissueSettings)
     except SceneError:  # a scene for the device alone, or one that tissue_sim rejects
-        return math.inf, NO_FRICTION
+        return math.inf, NO_FRICTION, NO_STEPS
     m, of = tissue.material, tissue.region_values
     pairs = zip(of('toughness'), of('blade_friction'), strict=True)
     most = max(sum(pair) for pair in [(m.toughness, m.blade_friction), *pairs])
-    return most, m.dry_friction
+    return most, m.dry_friction, tissue.steps
 
 
 def main() -> None:

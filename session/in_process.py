@@ -252,8 +252,14 @@ class InProcess:
 
 def make_force_path(scene: Scene) -> ForcePath:
     """Return the force loop of a scene, before its first tick."""
-    friction = scene.tissue.material.dry_friction
-    return ForcePath(scene.tool, scene.device, scene.haptics, scene.profile, friction=friction)
+    return ForcePath(
+        scene.tool,
+        scene.device,
+        scene.haptics,
+        scene.profile,
+        friction=scene.tissue.material.dry_friction,
+        steps=scene.tissue.steps,
+    )
 
 
 def simulate(scene: str, link: LinkSettings | None = None) -> InProcess:

@@ -206,6 +206,7 @@ def test_the_length_at_rest_counts_tissue_as_it_was_and_no_gap_between_two_piece
         np.zeros(POINTS),
         np.zeros(1, np.int64),
         np.zeros(POINTS, np.int64),
+        np.zeros(2),
     )
     near, opened = np.arange(len(mesh.tetrahedra)), np.zeros((0, 3), np.int32)
     of = mesh.tetrahedra, mesh.neighbors, near, opened, mesh.regions

@@ -64,7 +64,8 @@ def test_the_way_of_the_edge_is_continuous_in_the_pull_and_takes_no_more_than_it
 
 def test_the_spine_is_softer_than_the_flat_by_what_its_narrower_front_settles() -> None:
     piece, stretches = 5e-4, np.linspace(1e-5, 0.02, 50)
-    law = Law(10.0, 1.0, 0.0, np.array([1.0, 0.0, 0.0]), 2e-5, 0.0)
+    facing, known = np.array([1.0, 0.0, 0.0]), np.zeros((3, 3))
+    law = Law(10.0, 1.0, 0.0, facing, 2e-5, 0.0, 0.0, known)
     for stretch in stretches:
         force = law.stiffness * stretch - settled(stretch, piece, law)
         load = law.compliance * force / piece

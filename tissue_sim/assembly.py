@@ -94,6 +94,7 @@ def make_task(settings: TissueSettings, mesh: TetMesh | None = None) -> Task:
             m.blade_friction,
             settings.tip_width,
             tuple(resistance),
+            m.crack_length,
         ),
         settings.budget,
         TimeStepping(

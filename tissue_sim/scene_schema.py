@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
 from cutting_trainer.node_common.scene_reader import SceneModel, ScenePath
+from cutting_trainer.tissue_sim.contact.crack import Steps
 from cutting_trainer.tissue_sim.contact.friction import Friction
 from cutting_trainer.tissue_sim.contact.tool_spring import ContactName
 from cutting_trainer.tissue_sim.elasticity.models import ModelName
@@ -77,6 +78,13 @@ class MaterialSettings(SceneModel):
         ge=0,
         le=1e4,
         description='friction on the blade by length of edge in the tissue [N/m], 0 to 1e4',
+    )
+    crack_length: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.02,
+        description='length by which a crack runs at once before the blade, so that the force is a '
+        'sawtooth around its steady value; 0: it runs steadily [m], 0 to 0.02',
     )
 
     friction: float = Field(
@@ -370,6 +378,14 @@ class TissueSettings(SceneModel):
         common = getattr(self.material, name)
         given = [getattr(region, name) for region in self.regions]
         return [common if value is None else value for value in given]
+
+    @property
+    def steps(self) -> Steps:
+        """The steps in which a crack runs before the blade."""
+        return Steps(
+            self.material.crack_length,
+            max(self.material.blade_friction, *self.region_values('blade_friction'), 0.0),
+        )
 
     @model_validator(mode='after')
     def _check_damping(self) -> Self:

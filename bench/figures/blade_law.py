@@ -8,6 +8,7 @@ from bench.haptics.puncture import TOUGHNESS as PUNCTURED
 from bench.haptics.puncture import WIDTH, pushed_in
 from bench.haptics.turned_blade import PRICE, turned
 from bench.validate.blade import run_slicing
+from bench.validate.sawtooth import run_sawtooth
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 
 _HERTZ = 2.5
@@ -25,6 +26,7 @@ def measure() -> list[Figure]:
         *_leading(),
         *_puncture(),
         *_slicing(),
+        *_sawtooth(),
     ]
 
 
@@ -53,6 +55,12 @@ def _puncture() -> list[Figure]:
         Figure(7, 'force after it over J w, off 1', abs(usual / slit - 1), 0.1, 'at most', '', 1),
         Figure(7, 'the same over refined, off 1', abs(usual / refined - 1), 0.1, 'at most', '', 1),
     ]
+
+
+def _sawtooth() -> list[Figure]:
+    errors = [abs(result.error or 0.0) for result in run_sawtooth(quick=True)]
+    name = 'crack in steps: mean, length and work of the teeth, off 1, worst'
+    return [Figure(7, name, max(errors), 0.1, 'at most', '', len(errors))]
 
 
 def _slicing() -> list[Figure]:

@@ -16,7 +16,7 @@ from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.in_process import answer
 from cutting_trainer.tissue_sim.contact.blade import Resistance
-from cutting_trainer.tissue_sim.contact.tool import ContactState
+from cutting_trainer.tissue_sim.contact.tool import ContactState, Frame
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -102,36 +102,69 @@ def drawn(
         slice_push: speed along the edge over speed along x, of a blade through the whole block;
             None: the blade's tip stays at its depth.
     """
-    cells = tuple(round(s / cell) for s in SIZE)
-    nodes, tetrahedra = good_block((cells[0], cells[1], cells[2]), cell, seed=1)
-    mesh = TetMesh(nodes, tetrahedra, nodes[:, 2] < 1e-9)
-    count, top = len(mesh.tetrahedra), float(nodes[:, 2].max())
-    material = Material(youngs_modulus, 0.45, 1060.0, 15.0, 1e-4, STIFFENING)
-    simulation = TissueSimulation(
-        mesh,
-        material,
-        Resistance(0.02, toughness, 0.0),
-        model=model,
-        stepping=TimeStepping('symplectic_euler', rate=RATE, max_substeps=1000),
-    )
-    method, asks = make_method(CuttingSettings()), CutTransaction(simulation)
-    forces = []
+    simulation = block(model, Resistance(0.02, toughness, 0.0), youngs_modulus, cell, RATE)
+    count, top = len(simulation.mesh.tetrahedra), float(simulation.mesh.rest[:, 2].max())
     depth = DEPTH if slice_push is None else top + BELOW
     start = time.thread_time()
     stroke = STROKE if slice_push is None else SLICE
-    for tip in _way(top, depth, stroke, slice_push or 0.0):
+    tips = _way(top, depth, stroke, slice_push or 0.0)
+    forces = [-frame.force for frame in frames(simulation, tips, slices=slice_push is not None)]
+    cpu = time.thread_time() - start
+    steady = np.mean(forces[-round(STEADY * stroke / SPEED * RATE) :], axis=0)
+    return Drawn(steady, min(depth, top), simulation.elements_cut, count, cpu)
+
+
+def block(
+    model: ModelName,
+    resistance: Resistance,
+    youngs_modulus: float,
+    cell: float,
+    rate: float,
+    size: tuple[float, float, float] = SIZE,
+) -> TissueSimulation:
+    """Return a block of about a size [m] in cubes of twelve tetrahedra, fixed at its underside.
+
+    Args:
+        model: elastic model.
+        resistance: against the blade.
+        youngs_modulus: at small strain [Pa].
+        cell: edge of a cube [m].
+        rate: of frames [Hz].
+        size: along x, y and z [m].
+    """
+    cells = tuple(round(s / cell) for s in size)
+    nodes, tetrahedra = good_block((cells[0], cells[1], cells[2]), cell, seed=1)
+    return TissueSimulation(
+        TetMesh(nodes, tetrahedra, nodes[:, 2] < 1e-9),
+        Material(youngs_modulus, 0.45, 1060.0, 15.0, 1e-4, STIFFENING),
+        resistance,
+        model=model,
+        stepping=TimeStepping('symplectic_euler', rate=rate, max_substeps=2000),
+    )
+
+
+def frames(
+    simulation: TissueSimulation, tips: np.ndarray, *, slices: bool = False
+) -> Iterator[Frame]:
+    """Yield the frames of a blade that is drawn through a block and cuts it.
+
+    Args:
+        simulation: of the block.
+        tips: of the blade by frame [m], shape (k, 3).
+        slices: whether its edge is long and its coupling stiff.
+    """
+    mesh, top = simulation.mesh, float(simulation.mesh.rest[:, 2].max())
+    method, asks = make_method(CuttingSettings()), CutTransaction(simulation)
+    for tip in tips:
         if asks.due and asks.asked is not None:
             asks.resolve(*answer(method, asks.asked, simulation))
         place = np.array([tip[0], tip[1], top])
         contact = blade_contact(mesh, ContactState.TOUCHING, place, tip, _UP)
-        if slice_push is not None:
+        if slices:
             contact = replace(contact, blade_root=tip + EDGE * _UP, stiffness=STIFF)
         frame = simulation.frame(contact)
         asks.ask(frame)
-        forces.append(-frame.force)
-    cpu = time.thread_time() - start
-    steady = np.mean(forces[-round(STEADY * stroke / SPEED * RATE) :], axis=0)
-    return Drawn(steady, min(depth, top), simulation.elements_cut, count, cpu)
+        yield frame
 
 
 def _way(top: float, depth: float, stroke: float, slice_push: float) -> np.ndarray:

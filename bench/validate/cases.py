@@ -1,6 +1,6 @@
 """The published experiments."""
 
-from bench.validate import blade, homogeneous, relaxation, solids
+from bench.validate import blade, homogeneous, relaxation, sawtooth, solids
 from bench.validate.case import Case, NotReproduced, Source
 
 REVIEW = Source('Liu et al. 2022, a review', 'doi 10.1186/s10033-022-00767-4, table 2', 'table')
@@ -11,6 +11,7 @@ MAHVASH = Source('Mahvash et al. 2008', 'doi 10.1109/TBME.2007.908069', 'abstrac
 ATKINS = Source(
     'Atkins, Xu, Jeronimidis 2004', 'doi 10.1023/B:JMSC.0000021451.17182.86', 'abstract'
 )
+LIVER_CUTTING = Source('Chanthasopeephan, Desai, Lau 2003', 'doi 10.1114/1.1624601', 'abstract')
 TRUTH_CUBE = Source(
     'Kerdok et al. 2003, Truth Cube',
     'doi 10.1016/s1361-8415(03)00008-2; biorobotics.harvard.edu/truthcube/truthcube.html',
@@ -51,6 +52,19 @@ CASES: dict[str, Case] = {
             0.10,
             'chosen here',
             blade.run_slicing,
+        ),
+        Case(
+            'sawtooth',
+            'Force of a crack that runs in steps of 3 mm: its mean is J times the 5.5 mm of edge, '
+            'its teeth are as long as the steps, on any mesh and at any rate of frames',
+            (
+                LIVER_CUTTING,
+                Source('step on a linear spring', 'energy J L a of a tooth', 'formula'),
+            ),
+            0.10,
+            'chosen here; turns of loading and sudden unloading are published, the length of a '
+            'step is not',
+            sawtooth.run_sawtooth,
         ),
         Case(
             'truth-cube',

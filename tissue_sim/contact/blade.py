@@ -62,6 +62,7 @@ class Resistance:
         tip_width: of the slit that the tip opens [m]; 0: the blade enters by `threshold`, and its
             tip resists by nothing.
         regions: toughness and friction of regions 1, 2, ... of the mesh; region 0 has those above.
+        crack_length: by which a crack goes on at once [m]; 0: steadily.
     """
 
     threshold: float
@@ -69,6 +70,7 @@ class Resistance:
     friction: float
     tip_width: float = 0.0
     regions: tuple[tuple[float, float], ...] = ()
+    crack_length: float = 0.0
 
 
 class Turning(NamedTuple):
@@ -120,7 +122,9 @@ class Blade:
         toughness, friction = np.array([(r.toughness, r.friction), *r.regions]).T.copy()
         spine = float(line_compliance * np.log(BLADE_HEIGHT / BLADE_THICKNESS))
         at_tip = toughness * r.tip_width
-        self._law = Law(1.0, toughness, friction, np.zeros(3), spine, at_tip)
+        self._law = Law(
+            1.0, toughness, friction, np.zeros(3), spine, at_tip, r.crack_length, np.zeros((3, 3))
+        )
         self._device = np.array([root, tip])
         self._moved = np.zeros((POINTS, 3))
         self._state = Edge(
@@ -130,6 +134,7 @@ class Blade:
             np.zeros(POINTS),
             np.array([hint]),
             np.zeros(POINTS, np.int64),
+            np.zeros(2),
         )
         self._strips = Strips.empty()
         self._tip, self._edge = tip.copy(), root - tip
@@ -154,6 +159,10 @@ class Blade:
     def stretch(self) -> np.ndarray:
         """From the edge to the device's edge, at the points in the tissue [m], shape (p, 3)."""
         return self._stretch()[self._state.spans > 0.0]
+
+    def note_stiffness(self, stiffness: np.ndarray) -> None:
+        """Note the stiffness of tissue and coupling at the edge [N/m], shape (3, 3)."""
+        self._law = self._law._replace(rigidity=stiffness)
 
     def kept(self) -> dict[str, Any]:
         """Return the state for `restore`."""

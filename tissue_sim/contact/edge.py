@@ -5,6 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.contact.crack import (
+    borne_share,
+    bound_run,
+    next_tooth,
+    note_run,
+    places_at_rest,
+)
 from cutting_trainer.tissue_sim.contact.facing import (
     TINY,
     Held,
@@ -96,30 +103,38 @@ def follow_device(edge, strips, device, moved, tissue, law):
     paid, rubbed, swept, limit = 0.0, 0.0, 0.0, -1.0
     facing = across(law.facing, direction)
     if not edge.spans.any():
-        strips.counts[:] = 0
+        strips.counts[:], edge.running[:] = 0, 0.0
         return no_pull()
     law = _law_now(law, rest_length(edge, tissue))
     low, high = _box(edge, device)
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
     fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
     blade = Held(direction, facing, piece, np.zeros(POINTS))
+    points, places = edge.points, edge.points
     for _ in range(_MAX_SLIPS):
+        if law.crack > 0.0:
+            points, places = edge.points.copy(), places_at_rest(edge, tissue)
         limit, cut, rub, area = _slip(edge, strips, device, faces, blade, law, fresh, limits)
+        if limit < 0.0:
+            immerse(edge, device, tissue)
+            if law.crack > 0.0:
+                cut *= note_run(edge, points, places, tissue, fresh)
         paid, rubbed, swept = paid + cut, rubbed + rub, swept + area
-        if limit >= 0.0:
-            break
-        immerse(edge, device, tissue)
-        if not edge.spans.any():
+        if limit >= 0.0 or not edge.spans.any():
             break
     ways, arms = device - edge.points, SHARES * (POINTS * piece)
+    middle = (edge.spans * arms).sum() / max(edge.spans.sum(), TINY)
     if limit < 0.0:
         _resist(edge, ways.copy(), faces, blade, law, fresh, limits)
+    half = next_tooth(edge, ways, fresh, limits, piece, law).half
     held = hold(edge, ways, blade, law, limits)
-    limit, torque_limit = limits.sum(), (limits * arms).sum()
+    limit, torque_limit = limits.sum() + half, (limits * arms).sum() + half * middle
     # As it is pulled now, or will be if the device moves on.
     _resist(edge, moved.copy(), faces, blade, law, fresh, limits)
+    half = next_tooth(edge, moved, fresh, limits, piece, law).half
     hold(edge, ways, blade, law, limits)
-    limit, torque_limit = max(limit, limits.sum()), max(torque_limit, (limits * arms).sum())
+    limit = max(limit, limits.sum() + half)
+    torque_limit = max(torque_limit, (limits * arms).sum() + half * middle)
     force, torque = np.zeros(3), np.zeros(3)
     for i in range(POINTS):
         pull = law.stiffness * edge.spans[i] * ways[i]
@@ -216,7 +231,16 @@ def gather_loads(edge, loads):
 def _law_now(law, longer):
     """Return the law with toughness by area now, where the edge is longer at rest by a factor."""
     toughness = longer * law.toughness
-    return Law(law.stiffness, toughness, law.friction, law.facing, law.compliance, law.at_tip)
+    return Law(
+        law.stiffness,
+        toughness,
+        law.friction,
+        law.facing,
+        law.compliance,
+        law.at_tip,
+        law.crack,
+        law.rigidity,
+    )
 
 
 @inner
@@ -274,18 +298,23 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits):
     """
     slid, ways = np.zeros(POINTS), device - edge.points
     _resist(edge, ways, faces, blade, law, fresh, limits)
-    cutting = False
+    cutting, share = False, 1.0
+    if law.crack > 0.0:
+        share = borne_share(edge, next_tooth(edge, ways, fresh, limits, blade.piece, law))
     for i in range(POINTS):
         if edge.spans[i] == 0.0:
             continue
         size = max(np.sqrt(dot(ways[i], ways[i])), TINY)
-        slid[i] = max(size - limits[i] / (law.stiffness * edge.spans[i]), 0.0)
+        borne = share * limits[i] if fresh[i] else limits[i]
+        slid[i] = max(size - borne / (law.stiffness * edge.spans[i]), 0.0)
         if not fresh[i]:
             slid[i] = min(slid[i], _MAX_FREE_SLIP)
         ways[i] *= slid[i] / size
         cutting = cutting or (fresh[i] and slid[i] > SETTLED)
     if slid.max() < SETTLED:
         return limits.sum(), 0.0, 0.0, 0.0
+    if law.crack > 0.0:
+        bound_run(edge, slid, ways, fresh)
     knots = _knots(edge, device)
     work, rub, area = 0.0, 0.0, 0.0
     for i in range(POINTS):

@@ -29,6 +29,8 @@ class Law(NamedTuple):
         compliance: by which the spine goes deeper into the tissue than the flat would, by load per
             length [m^2/N].
         at_tip: resistance of the tip to going deeper along the blade, by region [N].
+        crack: length by which the edge goes on at once [m]; 0: it goes on steadily.
+        rigidity: stiffness of tissue and coupling at the edge [N/m], shape (3, 3); zero: unknown.
     """
 
     stiffness: float
@@ -37,6 +39,8 @@ class Law(NamedTuple):
     facing: np.ndarray
     compliance: float
     at_tip: np.ndarray
+    crack: float
+    rigidity: np.ndarray
 
 
 class Held(NamedTuple):

@@ -30,6 +30,8 @@ class Edge(NamedTuple):
         spans: how much of the edge each stands for [pieces]; 0: in the air, shape (POINTS,).
         hint: a tetrahedron near the edge, shape (1,).
         region: of the tissue around each, shape (POINTS,).
+        running: length at rest that a crack has still to run [m], and the length at rest of its
+            last slip over that now, shape (2,).
     """
 
     points: np.ndarray
@@ -38,6 +40,7 @@ class Edge(NamedTuple):
     spans: np.ndarray
     hint: np.ndarray
     region: np.ndarray
+    running: np.ndarray
 
 
 class Tissue(NamedTuple):

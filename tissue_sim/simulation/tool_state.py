@@ -235,7 +235,10 @@ class ToolState:
             force: on the tool [N], shape (3,).
         """
         outside = contact if self.blade is None else None
-        return self._stiffness.matrix(coupling, outside, self._moved, force)
+        stiffness = self._stiffness.matrix(coupling, outside, self._moved, force)
+        if self.blade is not None:
+            self.blade.note_stiffness(stiffness)
+        return stiffness
 
     def apply_cut(self, count: int, delta: TopologyDelta, touched: Touched) -> None:
         """Follow a change of connectivity; arguments as of `ToolSprings.apply_cut`."""
