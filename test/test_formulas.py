@@ -15,6 +15,7 @@ from cutting_trainer.cutting.parting import _gather as gather_around
 from cutting_trainer.cutting.snapping import PENDING, _can_join
 from cutting_trainer.haptic_bridge.emulated_arm.hand import _tremble
 from cutting_trainer.haptic_bridge.force_kernels import _rotate
+from cutting_trainer.haptic_bridge.proxy.kernels import _SAME_DIRECTION_COS, STATE, _touched
 from cutting_trainer.haptic_bridge.proxy.surface import LEAF_SIZE, _fitted_boxes
 from cutting_trainer.tissue_sim.elasticity import stiffening_simd
 from cutting_trainer.tissue_sim.elasticity.adaptive_law import _element_norms, add_tangent_rows
@@ -168,6 +169,26 @@ def test_boxes_of_the_surface_fit_their_triangles_over_a_frame() -> None:
         np.testing.assert_array_equal(box, [*both.min(axis=0), *both.max(axis=0)])
     both = np.concatenate([start[triangles], end[triangles]]).reshape(-1, 3)
     np.testing.assert_array_equal(boxes[0], [*both.min(axis=0), *both.max(axis=0)])
+
+
+def test_touched_triangles_push_in_as_many_directions_as_their_normals_have() -> None:
+    state = np.zeros(1, STATE)
+    surface = SimpleNamespace(triangles=np.arange(3, 33).reshape(10, 3))
+    near = state[0]['near'][0]
+    axes = np.array([[1, 1, 0], [1, -1, 0], [0, 1, 1], [0, 1, -1], [1, 0, 1]]) / math.sqrt(2)
+    normals = np.repeat(axes, 2, axis=0)
+    near['count'], near['order'][:10] = 10, np.arange(10)
+    near['triangle'][:10], near['normal'][:, :10] = np.arange(10), normals.T
+    records = [
+        SimpleNamespace(
+            near=[SimpleNamespace(**{n: near[n] for n in near.dtype.names})],
+            **{n: state[0][n] for n in ('push_normal', 'push_slot', 'nodes', 'position')},
+        )
+    ]
+    assert _touched(surface, 1.0, records) == len(axes)
+    np.testing.assert_allclose(state[0]['push_normal'][: len(axes)], axes)
+    assert np.abs(axes @ axes.T - np.eye(5)).max() < _SAME_DIRECTION_COS
+    np.testing.assert_array_equal(state[0]['push_slot'][: len(axes)], 2 * np.arange(5))
 
 
 def test_a_node_joins_the_cut_unless_an_edge_of_it_is_cut() -> None:

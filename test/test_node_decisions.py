@@ -134,6 +134,11 @@ def test_a_node_that_ends_rests_if_it_works_and_gives_back_what_it_configured(ac
     assert not node._active
 
 
+def test_a_replica_without_a_mesh_is_of_no_revision_and_no_connectivity() -> None:
+    replica = MeshReplica()
+    assert (replica.revision, replica.topology, len(replica.rest)) == (-1, -1, 0)
+
+
 def cutting(revision: int) -> Any:
     """The node `cutting` with a block of tissue at a revision."""
     mesh = TetMesh(*box((2, 2, 2), 0.01))

@@ -3,6 +3,7 @@
 import ast
 import itertools
 import signal
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from bench.faults import run
 from bench.faults.candidates import KINDS, Fault, draw
-from bench.faults.copy import Outcome, read_outcome
+from bench.faults.copy import Copy, Outcome, read_outcome
 from bench.faults.suspects import affected_functions, likely_tests
 
 pytestmark = pytest.mark.long
@@ -79,6 +80,9 @@ class StubCopy:
     def __init__(self, *_: Path) -> None:
         self.runs = 0
 
+    def other_commit(self) -> str:
+        return ''
+
     def run(
         self, tests: list[str], tier: str, number: int, fault: Fault | None, *options: str
     ) -> Outcome:
@@ -109,3 +113,21 @@ def test_an_interrupted_run_goes_on_with_the_fault_it_was_at(
     assert run.run_faults(ROOT, tmp_path, 3, 0, 'quick') == run.Status.FAILED
     again = run.load_trials(state, list)
     assert again[:2] == [first, second] and again[2].verdict == 'survived'
+
+
+def test_a_run_goes_on_only_at_the_commit_it_began_with(tmp_path: Path) -> None:
+    def git(*words: str) -> None:
+        named = ('-c', 'user.name=a', '-c', 'user.email=a@b')
+        subprocess.run(['git', *named, *words], cwd=tmp_path / 'checkout', check=True)
+
+    (tmp_path / 'checkout').mkdir()
+    git('init', '--quiet')
+    (tmp_path / 'checkout' / 'file').touch()
+    git('add', 'file')
+    git('commit', '--quiet', '-m', 'one')
+    copy = Copy(tmp_path / 'checkout', tmp_path / 'faults')
+    assert copy.other_commit() == ''
+    git('commit', '--quiet', '--allow-empty', '-m', 'two')
+    assert (
+        'give another --folder' in Copy(tmp_path / 'checkout', tmp_path / 'faults').other_commit()
+    )

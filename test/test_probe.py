@@ -88,7 +88,7 @@ def test_moves_that_are_missing_or_in_one_plane_leave_the_handedness_unknown():
 def test_a_move_is_found_once_it_has_come_to_rest(unit):
     times = np.arange(0, 3, 1e-3)
     ramp = np.clip(times - 0.5, 0, 1)[:, None] * [0.05, 0, 0]
-    positions = unit * (ramp + 2e-4 * np.sin(60 * times)[:, None])
+    positions = unit * ([0.3, -0.2, 0.1] + ramp + 2e-4 * np.sin(60 * times)[:, None])
     noise = unit * 4e-4
     ends = [
         n for n in range(100, 3000, 50) if find_move(times[:n], positions[:n], noise) is not None

@@ -61,6 +61,18 @@ class Copy:
             ready.touch()
         _git(self.root, 'checkout', '--quiet', '--force', '.')  # a killed run leaves its fault
 
+    def other_commit(self) -> str:
+        """Return a sentence if the copy is of another commit than the checkout has, else ''."""
+        commits = [
+            _git(root, 'rev-parse', '--short', 'HEAD') for root in (self.root, self._checkout)
+        ]
+        if commits[0] == commits[1]:
+            return ''
+        return (
+            f'{self.root.parent} has begun with commit {commits[0]}, and the checkout is at '
+            f'{commits[1]}: check that out to go on, or give another --folder'
+        )
+
     def _share_cache(self) -> None:
         """Give the sources the times of the checkout's, and its kernels to their folders' names."""
         cache = Path(os.environ['NUMBA_CACHE_DIR'])

@@ -125,6 +125,9 @@ def run_faults(checkout: Path, folder: Path, count: int, seed: int, last: str) -
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     console, state = Console(), folder / f'seed-{seed}.jsonl'
     copy = Copy(checkout, folder)
+    if sentence := copy.other_commit():
+        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+        return Status.FAILED
     trials = load_trials(state, lambda: draw(copy.root, count, seed))
     for name in ROUNDS[: ROUNDS.index(last) + 1]:
         # Those without kernels come first: nothing is compiled again for them.
