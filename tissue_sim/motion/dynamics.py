@@ -196,7 +196,8 @@ class Dynamics:
         if self.model.lawful:
             # Steps with the linear stiffness diverge where the law counts.
             u[:] = equilibrium(self.model, np.zeros_like(u), start=u, tolerance=1e-9)
-            return self.restart()
+            self.restart()
+            return
         first = 0.0
         for _ in range(50 if self.model.rotating else 1):
             residual = -self.model.force(u)
@@ -501,9 +502,7 @@ class Dynamics:
         stiffened, base = self._stiffened, self.inverse_mass
         return base if stiffened is None else stiffened.inverse(base)
 
-    def _motion(
-        self, slow: float, substeps: int, trouble: str, contacts: NearFaces
-    ) -> FrameMotion:
+    def _motion(self, slow: float, substeps: int, trouble: str, contacts: NearFaces) -> FrameMotion:
         force, elastic = self._elastic_now()
         if len(contacts.nodes):
             force = force - self.cut_contact.force(contacts, *self._state())
