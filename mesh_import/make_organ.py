@@ -5,8 +5,10 @@ see config/meshes/README.md, then run `python mesh_import/make_organ.py FOLDER`.
 """
 
 import argparse
+from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -21,6 +23,11 @@ EDGE_LENGTH_M = 0.0074
 MAX_ATTEMPTS = 8
 """fTetWild is not deterministic: the mesh with the longest stable time step is kept."""
 
+SUSPENDED_EDGES_M = (0.0052, 0.0125)
+"""Edges of the graded organ: where it is cut, and from `GRADED_OVER_M` away."""
+GRADED_OVER_M = 0.03
+CUT_BOX_M = ((-0.046, 0.010), (-0.024, 0.024), 0.016, 0.012)
+"""Where it is cut: along x and y, from what height, how deep below the surface."""
 
 PAD_SIZE_M = (0.06, 0.04)
 PAD_CELLS = (11, 7)
@@ -81,13 +88,60 @@ def liver(points: Points) -> NDArray[np.float64]:
     return -_smooth_minimum(-notched, points[..., 2], 0.005)
 
 
-def organ_surface() -> tuple[Points, NDArray[np.int32]]:
-    """Return the closed surface of `liver`: vertices [m], shape (v, 3); triangles, shape (t, 3)."""
+def suspended_liver(points: Points) -> NDArray[np.float64]:
+    """Return the signed distance to a liver with a thinner left lobe, a notch,
+    a fossa of the gallbladder and a hollow below, as `liver` does.
+    """
+    right = _ellipsoid(points, (-0.022, 0.002, 0.004), (0.047, 0.046, 0.0405))
+    left = _ellipsoid(points, (0.030, 0.008, 0.003), (0.046, 0.031, 0.023))
+    notch = _ellipsoid(points, (0.017, -0.043, 0.0), (0.009, 0.020, 0.040))
+    fossa = _ellipsoid(points, (-0.012, -0.046, -0.002), (0.010, 0.016, 0.014))
+    hollow = _ellipsoid(points, (0.004, 0.006, -0.006), (0.030, 0.018, 0.013))
+    solid = _smooth_minimum(right, left, 0.014)
+    for taken, width in ((notch, 0.008), (fossa, 0.005), (hollow, 0.006)):
+        solid = -_smooth_minimum(-solid, taken, width)
+    return -_smooth_minimum(-solid, points[..., 2], 0.005)
+
+
+def _edge_lengths(points: Points) -> NDArray[np.float64]:
+    """Return the edge lengths of the graded organ at some points [m]."""
+    (left, right), (front, back), low, deep = CUT_BOX_M
+    x, y, z = np.moveaxis(points, -1, 0)
+    away = np.hypot(
+        np.maximum(np.maximum(left - x, x - right), 0),
+        np.maximum(np.maximum(front - y, y - back), 0),
+    )
+    below = np.maximum(-suspended_liver(points) - deep, 0) + np.maximum(low - z, 0) / 2
+    share = np.clip(np.hypot(away, below) / GRADED_OVER_M, 0, 1)
+    fine, coarse = SUSPENDED_EDGES_M
+    return np.asarray(fine + (coarse - fine) * share)
+
+
+def graded_organ() -> tuple[Points, NDArray[np.int32]]:
+    """Fill `suspended_liver`, finer where it is cut; return nodes [m] and tetrahedra."""
+    vertices, triangles = organ_surface(suspended_liver)
+    cells = (35, 26, 17)
+    corners, tetrahedra = block(cells, 0.006)
+    corners += [0.0025, 0.0, -0.026]
+    attempts = (
+        _fill(
+            vertices, triangles, SUSPENDED_EDGES_M[1],
+            bg_vertices=corners, bg_tets=tetrahedra, bg_values=_edge_lengths(corners),
+        )
+        for _ in range(MAX_ATTEMPTS)
+    )  # fmt: skip
+    return min(attempts, key=lambda mesh: _stiffest_node(*mesh))
+
+
+def organ_surface(
+    solid: Callable[[Points], NDArray[np.float64]] = liver,
+) -> tuple[Points, NDArray[np.int32]]:
+    """Return the closed surface of a solid: vertices [m], shape (v, 3); triangles, shape (t, 3)."""
     from skimage.measure import marching_cubes
 
     low, high = np.array([-0.082, -0.056, -0.006]), np.array([0.086, 0.056, 0.054])
     axes = [np.arange(a, b, GRID_SPACING_M) for a, b in zip(low, high, strict=True)]
-    samples = liver(np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1))
+    samples = solid(np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1))
     vertices, triangles, _, _ = marching_cubes(samples, 0.0, spacing=(GRID_SPACING_M,) * 3)
     return vertices + low, triangles
 
@@ -99,18 +153,24 @@ def organ() -> tuple[Points, NDArray[np.int32]]:
     return min(attempts, key=lambda mesh: _stiffest_node(*mesh))
 
 
-def _fill(vertices: Points, triangles: NDArray[np.int32]) -> tuple[Points, NDArray[np.int32]]:
+def _fill(
+    vertices: Points,
+    triangles: NDArray[np.int32],
+    edge: float = EDGE_LENGTH_M,
+    **sizes: NDArray[Any],
+) -> tuple[Points, NDArray[np.int32]]:
     import pytetwild
 
     nodes, tetrahedra = pytetwild.tetrahedralize(
         vertices,
         triangles,
-        edge_length_abs=EDGE_LENGTH_M,
+        edge_length_abs=edge,
         epsilon=0.01,  # 1.7 mm of freedom for the surface, or small elements would follow it
         stop_energy=6.0,
         coarsen=True,
         num_threads=1,
         vtk_ordering=True,
+        **sizes,
     )
     underside = _underside(nodes, tetrahedra)
     nodes[underside, 2] = 0.0
@@ -182,6 +242,7 @@ def main() -> None:
     _write(folder / 'flap.msh', *block((12, 5, 3), 0.01 / 3))
     _write(folder / 'pad.msh', *pad())
     _write(folder / 'liver.msh', *organ())
+    _write(folder / 'liver_suspended.msh', *graded_organ())
 
 
 if __name__ == '__main__':

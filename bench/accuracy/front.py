@@ -14,6 +14,7 @@ PANELS = {
     'block': ('indentation', 'after_cut'),
     'flap': ('large_rotation',),
     'liver': ('large_strain',),
+    'liver_suspended': ('large_strain',),
     'pad': ('large_strain',),
     'palpation': ('indentation',),
 }
