@@ -74,5 +74,5 @@ def test_the_picture_labels_each_case_at_its_line() -> None:
 
 
 def test_an_unknown_case_is_refused_with_the_names_there_are() -> None:
-    with pytest.raises(SessionError, match='toughness, stiffness, slicing, truth-cube'):
+    with pytest.raises(SessionError, match='toughness, stiffness, slicing, sawtooth, scissors'):
         run_validate(['spleen'], quick=True)

@@ -1,6 +1,6 @@
 """The published experiments."""
 
-from bench.validate import blade, homogeneous, relaxation, sawtooth, solids
+from bench.validate import blade, homogeneous, relaxation, sawtooth, scissors, solids
 from bench.validate.case import Case, NotReproduced, Source
 
 REVIEW = Source('Liu et al. 2022, a review', 'doi 10.1186/s10033-022-00767-4, table 2', 'table')
@@ -65,6 +65,15 @@ CASES: dict[str, Case] = {
             'chosen here; turns of loading and sudden unloading are published, the length of a '
             'step is not',
             sawtooth.run_sawtooth,
+        ),
+        Case(
+            'scissors',
+            'Torque of scissors over the angle: one blade closes on a sheet that the other supports',
+            (MAHVASH,),
+            0.10,
+            'chosen here; where the mesh has opened the tissue before the edge, the edge goes on '
+            'unpaid, by up to a tenth of a millimetre each time',
+            scissors.run_scissors,
         ),
         Case(
             'truth-cube',
@@ -162,5 +171,4 @@ NOT_REPRODUCED = (
         ),
         'a needle spreads the tissue: it needs tools of a thickness',
     ),
-    NotReproduced('Scissors: force over the angle', MAHVASH, 'it needs two blades that close'),
 )
