@@ -68,7 +68,7 @@ CASES: dict[str, Case] = {
         ),
         Case(
             'scissors',
-            'Torque of scissors over the angle: one blade closes on a sheet that the other supports',
+            'Torque of scissors over the angle: a blade closes on a sheet that the other supports',
             (MAHVASH,),
             0.10,
             'chosen here; where the mesh has opened the tissue before the edge, the edge goes on '
