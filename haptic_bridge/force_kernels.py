@@ -76,6 +76,7 @@ STATE = record_type(
         ('held', 'f8'),  # [N] largest force that can hold the blade
         ('reach', 'f8'),  # share of the resistance that a blade so far from the surface may feel
         ('edge', 'f8', (2, 3)),  # [m] the blade of the last tick
+        ('grips', 'f8'),  # 1: what holds the tissue are jaws, not a blade
         ('advanced', 'f8', (3,)),  # [m] the edge by steps of a crack since the newest sample
         ('stick', friction.STICK, (1,)),
         ('energy', 'f8'),  # [J] of the passivity observer
@@ -210,6 +211,9 @@ def _tissue_force(
     out[:], torque[:] = 0.0, 0.0
     if contact == NONE:
         return
+    if contact == INSIDE and s.grips > 0.0:
+        _hold(setup, state, history, out)
+        return
     if h.count > 0 and not (c.one_force and contact == TOUCHING):
         depth = s.proxy - s.tip
         touching = contact == TOUCHING
@@ -239,6 +243,22 @@ def _tissue_force(
         torque[0] += s.arms[1, 1] * out[2] - s.arms[1, 2] * out[1]
         torque[1] += s.arms[1, 2] * out[0] - s.arms[1, 0] * out[2]
         torque[2] += s.arms[1, 0] * out[1] - s.arms[1, 1] * out[0]
+
+
+@inner
+def _hold(setup: np.ndarray, state: np.ndarray, history: np.ndarray, out: np.ndarray) -> None:
+    """Compute the force of tissue between jaws. They hold a point: a turn changes nothing."""
+    s, h = state[0], history[0]
+    if h.count == 0:
+        return
+    norm, most = np.sqrt(np.sum(h.stiffness * h.stiffness)), setup[0].max_stiffness
+    scale = most / norm if norm > most else 1.0
+    for k in range(3):
+        pull = 0.0
+        for j in range(3):
+            pull += h.stiffness[k, j] * (s.tip[j] - h.position[1, j])
+        out[k] = h.force[1, k] - scale * pull
+    safety.clamp(min(s.resistance, s.held), out)
 
 
 @inner

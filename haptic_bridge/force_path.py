@@ -232,6 +232,7 @@ class ForcePath:
         touched = self._touch(now_ns, surface, enabled)
         if self._contact != INSIDE or self.mode.is_grasper:
             self.mode = self.next_mode
+        self._s['grips'] = self.mode.is_grasper
         if fault or state is CrtkState.FAULT:
             self._s['force'] = self._s['torque'] = 0.0
         if not force_kernels.command(
@@ -248,7 +249,10 @@ class ForcePath:
         if self._contact != NONE:
             self.contact_time += elapsed
         self.max_force = max(self.max_force, self.force_norm)
-        contact = self._report.values(self._sequence, self._contact, surface, touched, self.mode)
+        mode = self.mode
+        if mode == ToolMode.CLOSED_GRASPER and not enabled:
+            mode = ToolMode.OPEN_GRASPER  # without force, the jaws let go
+        contact = self._report.values(self._sequence, self._contact, surface, touched, mode)
         return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
 
     def _take_pose(self, now_ns: int, pose: StampedMessage | None, enabled: bool) -> str:
@@ -383,8 +387,7 @@ class ForcePath:
                 self._s['held'] = before_cut + self._setup['slack'][0]
             self._contact = INSIDE
             assert surface is not None
-            reach = 1.0 if self.mode.is_grasper else self._plausibility.reach(surface, self._blade)
-            self._s['reach'] = reach
+            self._s['reach'] = self._plausibility.reach(surface, self._blade)
             self._s['proxy'] = self._tip
             return None
         if before == INSIDE or (before == TOUCHING and not enabled):

@@ -16,9 +16,10 @@ from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.recorded_tissue import first_current_keyframe, follow
 from cutting_trainer.bags.topic_names import CONTACT, MESH, SERVO_CF, UPDATES, of_session
-from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
 from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
 Floats = NDArray[np.float64]
@@ -84,7 +85,8 @@ def read_story(bag: Path, at: float | None) -> Story:
         at: moment [s]; None: the end.
     """
     story = Story()
-    state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
+    state, mode = (ContactCodec.fields[name].start for name in ('state', 'mode'))
+    force = WrenchStampedCodec.fields['force']
     contacts, wrenches = ContactCodec(), WrenchStampedCodec()
     places = [ContactCodec.fields[name] for name in ('device', 'blade_root', 'blade_tip')]
     tool, forces = [], []
@@ -100,7 +102,10 @@ def read_story(bag: Path, at: float | None) -> Story:
         if message.topic == CONTACT:
             stamp, _, values = contacts.decode(message.data)
             if stamp:  # 0: there was no device yet
-                tool.append([time, *(x for place in places for x in values[place]), *values[state]])
+                held = values[state]
+                if held == INSIDE and ToolMode(values[mode]).is_grasper:
+                    held = TOUCHING  # jaws hold the tissue: it is not cut
+                tool.append([time, *(x for place in places for x in values[place]), held])
         elif message.topic == servo_cf:
             norm = np.linalg.norm(wrenches.decode(message.data).values[force])
             forces.append([time, float(norm)])

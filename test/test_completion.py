@@ -33,7 +33,7 @@ def test_commands_are_those_of_the_help(tmp_path: Path) -> None:
         (('im',), ['import-mesh']),
         (('demo', '--js'), ['--json']),
         (('probe-device', '--no'), ['--no-moves']),
-        (('demo', '--scene', 'li'), ['liver']),
+        (('demo', '--scene', 'li'), ['liver', 'liver_suspended']),
         (('plan', 'fl'), ['flap']),
         (('import-mesh', '--unit', ''), ['m', 'cm', 'mm']),
         (('completion', 'z'), ['zsh']),

@@ -221,6 +221,6 @@ def test_a_tool_that_rests_in_a_trembling_hand_keeps_its_footprint() -> None:
         tip = pressed.device - depth * up
         contact = replace(pressed, device=tip + shift, offset=shift, radius=radius)
         simulation.frame(contact)
-        reaches.append(simulation._pushed_by(contact, simulation.positions).reach)
+        reaches.append(simulation.tools[0]._pushed_by(contact, simulation.positions).reach)
     assert len(set(reaches[:10])) > 5
     assert len(set(reaches[-30:])) == 1

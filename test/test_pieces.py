@@ -11,7 +11,6 @@ from strokes import draw, method_named, straight
 
 from bench.cuts.loose_pieces import counted
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
-from cutting_trainer.tissue_sim.contact.tool import ContactState
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister, free_parts, pieces_of
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -102,9 +101,10 @@ def test_the_node_tells_a_piece_with_its_mass_once_the_blade_is_out():
         _free_pieces=SimpleNamespace(publish=told.append),
     )
     node._simulation.positions = mesh.rest + 0.1
-    for state in (ContactState.INSIDE, ContactState.NONE, ContactState.NONE):
-        TissueSimNode._tell_pieces(node, SimpleNamespace(step=7, state=state))
-        assert len(told) == (state != ContactState.INSIDE)
+    for blade in (object(), None, None):
+        node._simulation.blade = blade
+        TissueSimNode._tell_pieces(node, SimpleNamespace(step=7))
+        assert len(told) == (blade is None)
     (message,) = told
     assert (message.number, message.step, message.topology) == (1, 7, mesh.topology)
     assert message.mass == pytest.approx(1060.0 * 4e-4 * SIZE[2], rel=0.01)

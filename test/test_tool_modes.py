@@ -12,6 +12,7 @@ from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.resimulation import as_recorded
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec
+from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation
 from cutting_trainer.recordings.what_if import computable_poses, run_experiment
@@ -76,9 +77,21 @@ def test_a_grasper_lifts_the_tissue_and_the_hand_feels_its_pull_until_the_jaws_o
     assert last < -0.05, 'the tissue pulls the hand down'
     assert max(np.abs(np.diff(felt))) < 0.02, 'no jump where the jaws close'
     assert session.tissue.simulation.positions[:, 2].max() > top + 2e-3
+    turned = session.tick(at(-0.008), (0.0, 0.3, 0.0, np.sqrt(1 - 0.09))).wrench
+    assert turned[2] == pytest.approx(last, rel=0.02), 'jaws hold a point: a turn is not felt'
+    assert not any(turned[3:])
     session.path.next_mode = ToolMode.OPEN_GRASPER
     session.wait(0.3, at(-0.008))
     assert session.tick(at(-0.008)).wrench[2] >= 0.0
+
+
+def test_jaws_let_go_where_no_force_may_be_commanded() -> None:
+    rig = Rig(haptics=QUIET, tool=ToolSettings(radius=RADIUS, mode='closed_grasper'))
+    rig.run(np.linspace(0.005, 0.001, 60))
+    assert rig.ticks[-1].contact[MODE] == ToolMode.CLOSED_GRASPER
+    rig.state = CrtkState.DISABLED
+    rig.run(0.001)
+    assert rig.ticks[-1].contact[MODE] == ToolMode.OPEN_GRASPER
 
 
 @pytest.mark.long

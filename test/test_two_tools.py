@@ -18,7 +18,7 @@ from cutting_trainer.tissue_sim.contact.tool import (
     ToolMode,
 )
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
@@ -195,12 +195,38 @@ def test_tissue_that_is_pulled_too_hard_slips_out_of_the_jaws() -> None:
     assert simulation.state == ContactState.NONE
 
 
-def test_jaws_that_close_in_the_air_hold_nothing() -> None:
+def test_jaws_that_close_in_the_air_hold_nothing_until_they_close_on_tissue() -> None:
     simulation = block()
-    above = at_node(simulation, 0.03, 0.015, TOP + 1e-3)
+    above, touching = (at_node(simulation, 0.03, 0.015, TOP + z) for z in (1e-3, -1e-3))
     frame = rest_under(simulation, grasper(above, closed=True), frames=3)
     assert frame.state == ContactState.NONE
     assert not frame.force.any()
+    assert rest_under(simulation, grasper(touching, closed=True)).state == ContactState.TOUCHING
+    simulation.frame(grasper(touching, closed=False))
+    assert simulation.frame(grasper(touching, closed=True)).state == ContactState.INSIDE
+
+
+def test_jaws_keep_what_they_press_down_however_hard() -> None:
+    simulation = block(modulus=50_000.0)
+    over = at_node(simulation, 0.03, 0.015, TOP - 1e-3)
+    simulation.frame(grasper(over, closed=True))
+    deep = replace(over, device=over.device - 4e-3 * UP)  # four radii, more than a pull may be
+    assert rest_under(simulation, grasper(deep, closed=True)).state == ContactState.INSIDE
+
+
+def test_a_grip_follows_its_nodes_when_others_are_removed() -> None:
+    simulation = block()
+    mesh = simulation.mesh
+    corner = int(np.linalg.norm(mesh.rest - [0.06, 0.03, TOP], axis=1).argmin())
+    held = replace(at_node(simulation, 0.06, 0.03, TOP - 1e-3), nodes=np.array([corner]))
+    simulation.frame(None, grasper(held, closed=True))
+    place = mesh.rest[simulation.tools[1]._grip.nodes[0]].copy()
+    for node in (0, int(mesh.tetrahedra[0, 1])):
+        star = np.sort(mesh.star(node))[::-1].astype(np.int64)
+        simulation.apply_cut(TopologyDelta(removed_tetrahedra=star))
+    grip = simulation.tools[1]._grip
+    np.testing.assert_array_equal(mesh.rest[grip.nodes[0]], place)
+    assert simulation.frame(None, grasper(held, closed=True)).others[0].state == ContactState.INSIDE
 
 
 def cut_beside_a_lifted_lip(*, cuts: bool) -> tuple[Tissue, list[Frame]]:

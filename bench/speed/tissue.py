@@ -185,10 +185,10 @@ class _Part:
         self._called = getattr(owner, method)
         setattr(owner, method, self._timed)
 
-    def _timed(self, *arguments: Any) -> Any:
+    def _timed(self, *arguments: Any, **named: Any) -> Any:
         start = time.thread_time()
         try:
-            return self._called(*arguments)
+            return self._called(*arguments, **named)
         finally:
             self.spent += time.thread_time() - start
 
@@ -218,7 +218,7 @@ def palpation(size: int, name: ModelName, nodes: int) -> list[Figure]:
         'choose the region': _Part(dynamics._active, 'choose'),
         'energy and guard': _Part(dynamics, '_motion'),
         'contact stiffness': _Part(simulation.tools[0]._stiffness, 'matrix'),
-        'reaction': _Part(simulation, '_reaction'),
+        'reaction': _Part(simulation.tools[0], 'reaction'),
         'encode': _Part(encoder, 'encode'),
     }
     rows = []

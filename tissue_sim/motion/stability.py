@@ -70,6 +70,7 @@ class FrequencyBound:
     ) -> None:
         self._model = model
         self._ceiling = np.inf
+        self._rows_over = 1.0
         self._rows = np.zeros(model.mesh.node_count)
         self._x = np.zeros(0)
         self._settled = 0.0
@@ -81,6 +82,9 @@ class FrequencyBound:
         self.refine(ALL_ITERATIONS)
         self._unscaled = self._settled
         self._ceiling = growth * self._settled
+        if growth < 1.0:  # Gershgorin's row of the worst node is that much above its frequency
+            worst = self._rows[inverse_mass[::3] > 0.0].max()
+            self._rows_over = float(worst) / self._unscaled**2
 
     @property
     def unscaled(self) -> float:
@@ -95,10 +99,9 @@ class FrequencyBound:
         gives the masses to `inverse_mass` and calls `refine` for the frequency that they leave.
         """
         self._done = 0
-        self._cut = [np.arange(self._model.mesh.node_count)]
-        mass, worst = self._model.mass, np.sqrt(self._rows[self._inverse_mass[::3] > 0.0].max())
-        share = self._rows * (self._unscaled / (self._ceiling * worst)) ** 2
-        return np.asarray(mass * np.maximum(1.0, share))
+        every = np.arange(self._model.mesh.node_count)
+        self._cut = [every]
+        return self.inertia(every)
 
     def update(self, nodes: np.ndarray, inverse_mass: np.ndarray) -> None:
         """Register the rows touched by a change of connectivity.
@@ -113,7 +116,8 @@ class FrequencyBound:
         self._rows[touched] = self._model.frequency_rows(touched)
         self._inverse_mass = inverse_mass
         worst = np.sqrt(self._rows[touched].max(initial=0.0))
-        self._provisional = max(self._provisional, min(float(worst), self._ceiling))
+        ceiling = self._ceiling * np.sqrt(self._rows_over)
+        self._provisional = max(self._provisional, min(float(worst), float(ceiling)))
         self._done = 0
         # The touched nodes may have the new highest mode: start with a share of it.
         n = mesh.node_count
@@ -134,7 +138,8 @@ class FrequencyBound:
 
     def inertia(self, nodes: np.ndarray) -> np.ndarray:
         """Return the integration masses of some nodes [kg], shape (r,)."""
-        return self._model.mass[nodes] * np.maximum(1.0, self._rows[nodes] / self._ceiling**2)
+        share = self._rows[nodes] / (self._rows_over * self._ceiling**2)
+        return np.asarray(self._model.mass[nodes] * np.maximum(1.0, share))
 
     def refine(self, steps: int = 4) -> None:
         """Run some power iterations unless the bound has converged.

@@ -320,6 +320,7 @@ def _check_far_field(dynamics: Any, n: int) -> None:
     has_room('blocks', stiffness.blocks, 9 * slots + 1)
     has_room('_level', far._level, n)
     within('_far', far._far, n)
+    has_room('_centres', far._centres, 0, 3)
     has_room('_mass', far._mass, 0)
     within('_mass', [len(far._mass)], grid.count + 1)
 
@@ -405,9 +406,14 @@ def _check_tool(tool: ToolState, dynamics: Dynamics, n: int) -> None:
             has_room(name, place, 3)
     if (grip := tool._grip) is not None:
         within('nodes of the grip', grip.nodes, n)
-        has_room('weights of the grip', grip.weights, len(grip.nodes))
-        has_room('offset of the grip', grip.offset, 3)
-        has_room('end of the grip', grip.end, 3)
+        if len(grip.nodes) == 0 or grip.weights.shape != grip.nodes.shape:
+            raise StateError(
+                f'{len(grip.nodes)} nodes of the grip have {len(grip.weights)} weights'
+            )
+        for name in ('offset', 'end', 'normal'):
+            has_room(f'{name} of the grip', getattr(grip, name), 3)
+    if tool._edge is not None:
+        has_room('_edge', tool._edge, 2, 3)
     if tool.blade is not None:
         _check_blade(tool.blade, n)
 
@@ -417,6 +423,8 @@ def _check_blade(blade: Any, n: int) -> None:
     for name, width in (('points', 3), ('corners', 4), ('weights', 4)):
         has_room(f'{name} of the edge', getattr(edge, name), POINTS, width)
     has_room('spans of the edge', edge.spans, POINTS)
+    has_room('running of the edge', edge.running, 2)
+    has_room('rigidity of the blade', blade._law.rigidity, 3, 3)
     has_room('hint of the edge', edge.hint, 1)
     has_room('region of the edge', edge.region, POINTS)
     within('region of the edge', edge.region, len(blade._law.toughness))

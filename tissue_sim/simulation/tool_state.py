@@ -40,12 +40,14 @@ class Grip(NamedTuple):
         offset: from that tissue to the tool, where the spring between them is relaxed [m], shape
             (3,).
         end: tool's end of the spring at the end of the last frame [m], shape (3,).
+        normal: of the surface where the jaws closed, outward, shape (3,).
     """
 
     nodes: np.ndarray
     weights: np.ndarray
     offset: np.ndarray
     end: np.ndarray
+    normal: np.ndarray
 
 
 class ToolState:
@@ -83,6 +85,7 @@ class ToolState:
         self._pressed = 0.0
         self._dent = Dent()
         self._grip: Grip | None = None
+        self._mode = ToolMode.SCALPEL
         self._target: np.ndarray | None = None
         self._device: np.ndarray | None = None
         self._edge: np.ndarray | None = None
@@ -243,6 +246,14 @@ class ToolState:
     def apply_cut(self, count: int, delta: TopologyDelta, touched: Touched) -> None:
         """Follow a change of connectivity; arguments as of `ToolSprings.apply_cut`."""
         self._springs.apply_cut(count, delta, touched)
+        if self._grip is not None:
+            nodes = self._grip.nodes.copy()
+            for target, source in touched.renumbered:
+                nodes[nodes == target] = -1  # it is gone
+                nodes[nodes == source] = target
+            left = self._dynamics.mesh.node_count
+            lost = bool(((nodes < 0) | (nodes >= left)).any())
+            self._grip = None if lost else self._grip._replace(nodes=nodes)
 
     def _pushed_by(self, contact: ToolContact, positions: np.ndarray) -> Coupling:
         """Return the spring of a contact.
@@ -266,19 +277,23 @@ class ToolState:
         """Return whether the jaws still hold tissue."""
         grip = self._grip
         if grip is not None:
-            pulled = np.linalg.norm(grip.end - grip.weights @ positions[grip.nodes])
+            pull = grip.end - grip.weights @ positions[grip.nodes]
+            pull = pull - min(float(pull @ grip.normal), 0.0) * grip.normal  # not what is pressed
             most = min(MAX_PULL_N / contact.stiffness, MAX_STRETCH_RADII * contact.radius)
-            if pulled >= most or contact.mode != ToolMode.CLOSED_GRASPER:
+            if np.linalg.norm(pull) >= most or contact.mode != ToolMode.CLOSED_GRASPER:
                 self._grip = None
         return self._grip is not None
 
     def _close(self, contact: ToolContact, spring: Coupling) -> None:
-        """Grasp the tissue that the closed jaws touch; the spring keeps its force."""
-        if contact.mode == ToolMode.CLOSED_GRASPER and spring.mode == PUSH:
+        """Grasp the tissue that jaws touch as they close; the spring keeps its force."""
+        closes = contact.mode == ToolMode.CLOSED_GRASPER and self._mode != contact.mode
+        self._mode = contact.mode
+        if closes and spring.mode == PUSH:
             positions = self._dynamics.positions
             point = spring.point(positions)
             end = point + spring.force(positions) / spring.stiffness
-            self._grip = Grip(spring.nodes, spring.weights, contact.device - end, end)
+            offset = contact.device - end
+            self._grip = Grip(spring.nodes, spring.weights, offset, end, spring.normal)
             self._target = None
 
     def _held_by(self, contact: ToolContact) -> Coupling:
