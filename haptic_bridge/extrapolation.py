@@ -114,6 +114,18 @@ def position_linear(
 
 
 @inner
+def rendered_share(stiffness: np.ndarray, max_stiffness: float) -> float:
+    """Return the share of a stiffness that the device renders: all up to a Frobenius norm.
+
+    Args:
+        stiffness: [N/m], shape (3, 3).
+        max_stiffness: that norm [N/m].
+    """
+    norm = np.sqrt(np.sum(stiffness * stiffness))
+    return max_stiffness / norm if norm > max_stiffness else 1.0
+
+
+@inner
 def local_blade(
     position: np.ndarray,
     arms: np.ndarray,
@@ -129,7 +141,7 @@ def local_blade(
     G = G_i - K mean(s d), and the torque about the tip e x G, where e leads from tip to root. A
     blade that is not turned has moved by P - P_i everywhere.
 
-    K is scaled down where its Frobenius norm exceeds the stiffness that the device renders.
+    K is scaled down by `rendered_share`.
 
     Args:
         position: P [m], shape (3,).
@@ -140,8 +152,7 @@ def local_blade(
         torque: [N m], shape (3,).
     """
     h = history[0]
-    norm = np.sqrt(np.sum(h.stiffness * h.stiffness))
-    scale = max_stiffness / norm if norm > max_stiffness else 1.0
+    scale = rendered_share(h.stiffness, max_stiffness)
     mean, square = h.immersed[0], h.immersed[1]
     before, now = h.arms[0] - h.arms[1], arms[0] - arms[1]
     length = before[0] ** 2 + before[1] ** 2 + before[2] ** 2
@@ -194,8 +205,7 @@ def step_ahead(
     size = np.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     if size <= limit:
         return False
-    norm = np.sqrt(np.sum(h.stiffness * h.stiffness))
-    scale = max_stiffness / norm if norm > max_stiffness else 1.0
+    scale = rendered_share(h.stiffness, max_stiffness)
     stiffness = 0.0
     for k in range(3):
         for j in range(3):

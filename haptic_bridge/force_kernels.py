@@ -217,11 +217,12 @@ def _tissue_force(
     if h.count > 0 and not (c.one_force and contact == TOUCHING):
         depth = s.proxy - s.tip
         touching = contact == TOUCHING
-        extrapolation.estimate(
-            c.law, history, time, s.tip, depth, touching, s.arms, c.max_stiffness, out, torque
-        )
         if c.steps[0] > 0.0 and c.law == extrapolation.LOCAL_STIFFNESS and not touching:
             _run_in_steps(setup, state, history, time, out, torque)
+        else:
+            extrapolation.estimate(
+                c.law, history, time, s.tip, depth, touching, s.arms, c.max_stiffness, out, torque
+            )
     elif contact == TOUCHING:
         for k in range(3):
             out[k] = -s.external[k]  # until the tissue has answered
@@ -251,8 +252,7 @@ def _hold(setup: np.ndarray, state: np.ndarray, history: np.ndarray, out: np.nda
     s, h = state[0], history[0]
     if h.count == 0:
         return
-    norm, most = np.sqrt(np.sum(h.stiffness * h.stiffness)), setup[0].max_stiffness
-    scale = most / norm if norm > most else 1.0
+    scale = extrapolation.rendered_share(h.stiffness, setup[0].max_stiffness)
     for k in range(3):
         pull = 0.0
         for j in range(3):

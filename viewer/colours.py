@@ -1,8 +1,12 @@
-"""Colours of the tissue and of the cut, for pages and for markers: red, green, blue, 0 to 255."""
+"""Colours of the tissue, for pages and for markers: red, green, blue, 0 to 255.
+
+The page has its own colours of the cut, in `static/tissue.js`.
+"""
 
 Colour = tuple[int, int, int]
 
 TISSUE: Colour = (205, 118, 100)
 CUT: Colour = (120, 8, 22)
+"""Of the markers."""
 OTHER_TISSUE: Colour = (120, 140, 190)
 """A tissue that is computed again, beside the recorded one."""

@@ -1,4 +1,6 @@
-"""Kernels of the blade's edge: it slips through the tissue, and the tissue takes it along."""
+"""Kernels of the blade's edge, with its force law (`_resist`): where it slips through the tissue,
+and how the tissue takes it along.
+"""
 
 from typing import NamedTuple
 
