@@ -67,11 +67,21 @@ def point(page: Page, place: np.ndarray) -> None:
     time.sleep(1.0)
 
 
-def cut(page: Page, begin: np.ndarray, end: np.ndarray) -> None:
-    """Cuts from one place of the surface to another [m], the button held."""
+def cut(page: Page, begin: np.ndarray, end: np.ndarray, notches: int = 0) -> None:
+    """Cuts from one place of the surface to another [m], the button held.
+
+    Args:
+        page: to use.
+        begin: of the cut.
+        end: of it.
+        notches: of the wheel, each 0.5 mm deeper than 6 mm.
+    """
     point(page, begin)
     places = page.pixels(np.linspace(begin, end, 12))
     page.mouse('mousePressed', *places[0], pressed=True)
+    x, y = places[0]
+    for _ in range(notches):
+        page.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0, deltaY=120)
     time.sleep(1.0)
     for place in places[1:]:
         page.mouse('mouseMoved', *place, pressed=True)

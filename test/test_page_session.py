@@ -36,6 +36,8 @@ pytestmark = [
 
 BEGIN, MIDDLE, END = (np.array([x, 0.0, 0.010]) for x in (-0.012, 0.0, 0.014))
 """[m] places on a block that is 10 mm high."""
+NOTCHES = 5
+"""Of the wheel, by which it is cut deeper than 6 mm."""
 COMMAND_TIMEOUT_S = 240
 
 
@@ -59,17 +61,14 @@ class Made:
 def use(page: Page, known: set[Path]) -> tuple[Path, Any, Any]:
     """Cuts, records the next cut alone; the bag, and the page's state before and after it."""
     page.wait(lambda: page.state().get('tip') and page.state()['meshes'], 'the page')
-    cut(page, BEGIN, MIDDLE)
+    cut(page, BEGIN, MIDDLE, NOTCHES)
     before = page.state()
     page.evaluate("document.querySelector('#record').click()")  # the mouse holds the cut
     page.wait(lambda: page.state()['recording'] and not page.state()['busy'], 'the recording')
-    places = page.pixels(np.linspace(MIDDLE, END, 12))
-    for place in places:
-        page.mouse('mouseMoved', *place, pressed=True)
-        time.sleep(0.1)
-    time.sleep(0.7)
-    page.mouse('mouseReleased', *places[-1])
+    page.mouse('mouseReleased', *page.pixels(MIDDLE[None])[0])
+    cut(page, MIDDLE, END, NOTCHES)
     after = page.state()
+    page.mouse('mouseReleased', *page.pixels(END[None])[0])
     page.press('record')
     page.wait(lambda: not page.state()['recording'] and not page.state()['busy'], 'its end')
     (bag,) = sessions() - known
