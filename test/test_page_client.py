@@ -57,6 +57,47 @@ def opened(browser: Browser, stand_in: StandIn) -> Iterator[Page]:
         page.open('about:blank')
 
 
+REACHED = """(() => {
+    const at = (x, y) => document.elementFromPoint(x, y);
+    const middle = r => [r.x + r.width / 2, r.y + r.height / 2];
+    const box = e => e.getBoundingClientRect();
+    const buttons = [...document.querySelectorAll('#guide button, #views button')];
+    const hidden = buttons.filter(one => at(...middle(box(one))) !== one);
+    const view = box(document.querySelector('#view')), shares = [0.35, 0.5, 0.65];
+    const covered = shares.flatMap(x => shares.map(y =>
+        at(view.x + x * view.width, view.y + y * view.height)?.tagName));
+    const panel = [...document.querySelectorAll('#panel button, #panel select, #panel input')];
+    const lost = panel.filter(one => one.offsetParent !== null).filter(one => {
+        one.scrollIntoView({block: 'center'});
+        return at(...middle(box(one))) !== one;
+    });
+    return {hidden: hidden.map(one => one.innerText), covered, lost: lost.map(one => one.id),
+        small: buttons.filter(one => box(one).height < 38).length};
+})()"""
+NAMELESS = """[...document.querySelectorAll('button, select, input, output, [role]')].filter(one =>
+    !(one.innerText || one.ariaLabel || one.title || one.labels?.length || one.closest('[hidden]')
+      || ['status', 'alert', 'log'].includes(one.role) || one.tagName === 'OUTPUT')
+).map(one => one.outerHTML)"""
+
+
+def test_every_control_is_reached_and_none_covers_the_tissue_at_every_size(
+    browser: Browser,
+) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        for width, height in SIZES:
+            page.resize(width, height)
+            there = page.evaluate(REACHED)
+            assert not there['hidden'] and not there['lost'], (width, height, there)
+            assert set(there['covered']) <= {'CANVAS', 'MAIN'}, (width, height, there)
+            assert not there['small'], (width, height, there)
+        page.resize(1000, 700)
+        assert page.evaluate(NAMELESS) == []
+        assert page.evaluate('document.title') == 'Cutting trainer'
+        assert page.evaluate('document.documentElement.lang') == 'en'
+
+
 def key(page: Page, code: str, name: str) -> None:
     for kind in ('keyDown', 'keyUp'):
         page.call('Input.dispatchKeyEvent', type=kind, code=code, key=name)
@@ -135,7 +176,7 @@ def test_blade_follows_the_pointer_and_goes_in_while_the_button_is_held(browser:
         assert page.state()['camera'] == view  # it was no turn of the view
         time.sleep(0.5)  # until it is at its height again
         goals = len(stand_in.of(Guide))
-        page.drag(np.array([[380.0, 600.0], [390.0, 600.0], [450.0, 610.0]]))
+        page.drag(np.array([[290.0, 520.0], [300.0, 520.0], [360.0, 530.0]]))
         assert page.state()['camera'] != view  # beside the tissue it is one
         assert len(stand_in.of(Guide)) == goals
 

@@ -19,7 +19,7 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.viewer.access_control import link, make_gate
 from cutting_trainer.viewer.replay_page import ReplayPage
 
-_LONGEST_S = 60.0
+_MAX_PLAYED_S = 60.0
 """[s] that a session may play."""
 
 
@@ -82,7 +82,7 @@ def main() -> None:
     load = os.getloadavg()[0]
     with chromium((width, height)) as browser:
         url = link(LOCAL, page.server.port, [], gate.token)
-        found = measure(browser, url, min(given.seconds, _LONGEST_S))
+        found = measure(browser, url, min(given.seconds, _MAX_PLAYED_S))
     ended.append(True)
     page.server.stop()
     shown = {name: round(value, 2) for name, value in found.items()}
