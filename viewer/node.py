@@ -297,7 +297,7 @@ class ViewerNode(ManagedNode):
             return 'The haptic bridge is silent.'
         if self._operation.e_stopped:
             return 'E-STOP: no force until it is reset, and then Start.'
-        guided = 'Drag the blade to move it.' if can_guide else ''
+        guided = 'The blade follows the pointer; hold the button to cut.' if can_guide else ''
         said = {
             CrtkState.ENABLED: f'Force is on. {guided}',
             CrtkState.PAUSED: 'No force. Start goes on.',
