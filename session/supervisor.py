@@ -193,7 +193,8 @@ class Supervisor:
 
         Args:
             seconds: longest duration [s].
-            until_done: nodes whose lines `done: NAME` end the session, once all of them have come.
+            until_done: nodes whose lines `done: NAME` end the session, once all of them that live
+                have written it.
             tick: called often with the elapsed time [s]; the session ends when it returns False.
         """
         assert self._began is not None, 'start() first'
@@ -204,8 +205,10 @@ class Supervisor:
             elapsed = time.monotonic() - self._began
             if tick(elapsed) is False:
                 break
-            if until_done and all(n in self._nodes and self._nodes[n].done for n in until_done):
-                self.outcome.finished = True
+            awaited = [self._nodes[name] for name in until_done if name in self._nodes]
+            done = [node for node in awaited if node.done]
+            if done and all(node.done or not node.alive for node in awaited):
+                self.outcome.finished = len(done) == len(awaited)
                 break
         self.outcome.seconds = elapsed
 

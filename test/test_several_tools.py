@@ -1,11 +1,14 @@
 """Claims about a scene with several tools: its section, its processes, its bag."""
 
+import json
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from cutting_trainer.bags.comparison import Comparison
 from cutting_trainer.bags.recorded_frames import FrameRecord, ToolRecord
 from cutting_trainer.bags.resimulation import lacking_contact
 from cutting_trainer.bags.topic_names import further_tools
@@ -14,6 +17,7 @@ from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSetti
 from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.node_common.operating_state import OperatingStateMachine
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
+from cutting_trainer.recordings import resimulate_command
 from cutting_trainer.session.e_stop_latch import PRESSED, RELEASED, EStopState
 from cutting_trainer.session.node_commands import (
     ARM_NODE,
@@ -178,3 +182,15 @@ def test_a_frame_cannot_be_computed_without_the_contact_of_each_tool() -> None:
         'the bag lacks the contact of tool 1 that loaded this frame'
     )
     assert lacking_contact(record(None)) == 'the bag lacks the inputs of tool 1'
+
+
+def test_what_a_bag_lacks_is_in_the_json(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = Comparison(frames=3, missing=Counter({'poses of the device': 2}))
+    for name in ('find_beginning', 'recomputation', 'pose_check', 'recorded_code'):
+        monkeypatch.setattr(resimulate_command, name, lambda *_: None)
+    monkeypatch.setattr(resimulate_command, 'compare', lambda *_: result)
+    bag: Any = SimpleNamespace(custom_data={})
+    resimulate_command._verify(bag, cast('Any', None), as_json=True)
+    assert json.loads(capsys.readouterr().out)['missing'] == {'poses of the device': 2}
