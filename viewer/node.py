@@ -24,7 +24,7 @@ from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_re
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.node_common.output import announce
 from cutting_trainer.node_common.parameters import parameter, scene_parameter
-from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.share_folder import scene_names
 from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
@@ -107,7 +107,7 @@ class ViewerNode(ManagedNode):
         self._asked = Requests()
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._operation = Operation(
-            self, lambda text: self._calls.put(lambda: self._page.warn(text))
+            self, lambda text: self._calls.put(lambda: self._page.warn(text)), tool_names(scene)
         )
         self._open_page()
         self._loop = PeriodicLoop(RATE_HZ)
