@@ -143,17 +143,19 @@ def _lie_in(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return which points, shape (p, 3), lie in one of some triangles, shape (k, 3, 3), within
     rounding.
     """
-    found = np.zeros(len(points), bool)
-    for a, b, c in triangles:
-        normal = np.cross(b - a, c - a)
-        size = float(np.linalg.norm(normal))
-        rest = points - a
-        near = np.abs(rest @ normal) <= 1e-7 * size**1.5
-        if near.any():
-            for p, q in ((a, b), (b, c), (c, a)):
-                near &= np.cross(q - p, points - p) @ normal >= -1e-7 * size**2
-            found |= near
-    return found
+    if len(points) == 0 or len(triangles) == 0:
+        return np.zeros(len(points), bool)
+    first = triangles[:, 0]
+    normals = np.cross(triangles[:, 1] - first, triangles[:, 2] - first)
+    sizes = np.linalg.norm(normals, axis=1)
+    distances = points @ normals.T - np.einsum('kj,kj->k', first, normals)
+    point, triangle = np.nonzero(np.abs(distances) <= 1e-7 * sizes**1.5)
+    corners, normal = triangles[triangle], normals[triangle]
+    sides = np.roll(corners, -1, axis=1) - corners
+    inward = np.cross(sides, points[point][:, None] - corners)
+    along = np.einsum('nij,nj->ni', inward, normal)
+    inside = (along >= -1e-7 * sizes[triangle, None] ** 2).all(axis=1)
+    return np.bincount(point[inside], minlength=len(points)) > 0
 
 
 def pieces(mesh: TetMesh) -> np.ndarray:

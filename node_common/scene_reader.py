@@ -79,9 +79,7 @@ def read_section(path: Path, section: str, model: type[M], tool: str = '') -> M:
     Raises:
         SceneError: one sentence with file, line, key, value and remedy.
     """
-    root = _compose(path)
-    document = _plain(root, path, ())
-    _check_sections(root, path)
+    root, document = _read(path)
     if tool:
         root, document = _as_of_tool(root, document, path, section, tool)
     content = document.get(section)
@@ -104,9 +102,7 @@ def tool_names(path: Path) -> tuple[str, ...]:
     Raises:
         SceneError: one sentence with file, line, key, value and remedy.
     """
-    root = _compose(path)
-    _plain(root, path, ())
-    _check_sections(root, path)
+    root, _ = _read(path)
     return tuple(str(key.value) for key, _ in _pairs(_child(root, TOOLS)))
 
 
@@ -155,12 +151,12 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def _compose(path: Path) -> MappingNode:
+def _read(path: Path) -> tuple[MappingNode, dict[str, Any]]:
+    """Return the nodes and the plain values of a scene file."""
     if not path.is_file():
         raise SceneError(f'scene file {missing_file(path)}')
     try:
-        text = bounded_yaml(path)
-        root = YAML(typ='safe', pure=True).compose(text)
+        return _parsed(path, read_bounded(path))
     except YamlBoundError as error:
         raise SceneError(error.of(path)) from None
     except UnicodeDecodeError as error:
@@ -171,12 +167,21 @@ def _compose(path: Path) -> MappingNode:
         raise SceneError(f'{path} cannot be read: {error.strerror}') from None
     except YAMLError as error:
         raise SceneError(syntax_error(path, error)) from None
+
+
+@functools.lru_cache(maxsize=8)  # a scene is read once for each of its sections
+def _parsed(path: Path, text: str) -> tuple[MappingNode, dict[str, Any]]:
+    """Return the nodes and the plain values of the text of a scene; nobody changes them."""
+    check_yaml(text)
+    root = YAML(typ='safe', pure=True).compose(text)
     expected = f'a scene is a mapping of the sections {", ".join(SECTIONS)}'
     if root is None:
         raise SceneError(f'{path} is empty: {expected}')
     if not isinstance(root, MappingNode):
         raise SceneError(f'{path}:{_line(root)}: the file is a {_kind(root)}: {expected}')
-    return root
+    document = _plain(root, path, ())
+    _check_sections(root, path)
+    return root, document
 
 
 def bounded_yaml(path: Path) -> str:
@@ -191,7 +196,6 @@ def bounded_yaml(path: Path) -> str:
     return text
 
 
-@functools.lru_cache(maxsize=8)  # a scene is read once for each of its sections
 def check_yaml(text: str) -> None:
     """Refuse YAML with too many values, too deep nesting, or values that contain themselves.
 

@@ -204,6 +204,7 @@ def lived(
 ) -> Lived:
     """The node's own loop under recorded contacts, in a time of its own."""
     clock, stop, simulation = Clock(), Stop(), node._simulation
+    node._announced = -np.inf  # no recorder is waited for
     monkeypatch.setattr(node_module, 'time', clock)
     monkeypatch.setattr(cut_client, 'time', clock)
     cutting = Cutting(clock, simulation, scene, delays)
