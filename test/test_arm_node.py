@@ -31,7 +31,7 @@ from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.node_common.realtime import PRIORITY
 from cutting_trainer.node_common.timing import request_real_time
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = 88

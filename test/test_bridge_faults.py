@@ -19,7 +19,7 @@ from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedCodec
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 DOMAIN = 86
 SCENE = """

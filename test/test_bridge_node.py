@@ -20,7 +20,7 @@ from bridge_world import (
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.live
 
 DOMAIN = 87
 SCENE = """
