@@ -1,6 +1,6 @@
 """Colours of the tissue, for pages and for markers: red, green, blue, 0 to 255.
 
-The page has its own colours of the cut, in `static/tissue.js`.
+The page has those of the cut and of the tools in `static/colours.js`.
 """
 
 Colour = tuple[int, int, int]

@@ -1,11 +1,11 @@
 // Below the tip: its shadow on the surface, and a line between both that shows height or depth.
 
+import { ABOVE, BELOW } from './colours.js';
 import { fadedTexture } from './faded_texture.js';
 import {
   CylinderGeometry, Group, Mesh, MeshBasicMaterial, PlaneGeometry, RingGeometry, Vector3,
 } from './vendor/three.module.min.js';
 
-const ABOVE = 0xe8f1f8, BELOW = 0xffd166;
 const RADIUS = 0.0003; // [m] of the line
 const TICK = 0.005, TICK_SIDE = 0.0012; // [m] between two marks of the line, and their radius
 const MAX_TICKS = 8;

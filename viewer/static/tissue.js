@@ -1,17 +1,14 @@
 // One tissue in the scene: its outside, the cut faces, and a band of blood along the edges of the cuts.
 
+import { BLOOD, CORE, FAT, OPENED } from './colours.js';
 import { fadedTexture } from './faded_texture.js';
 import {
   Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Group, Mesh, MeshBasicMaterial,
   MeshPhongMaterial, SRGBColorSpace,
 } from './vendor/three.module.min.js';
 
-const OPENED = 0xa30a18;
-const CORE = 0x2a0206; // between the lips of a cut
 const CORE_RADIUS = 0.0006; // [m]
-const BLOOD = 0xb00012;
 const BAND = 0.0026; // [m] half the width of the blood beside a cut
-const FAT = [1.75, 5.5, 3.6]; // of the opened colour at the skin: the rim of a cut face is pale
 const RIM = 0.0012, DEEP = 0.012; // [m] under the edge of a cut: thickness of the rim, the darkest
 
 export class TissueView {

@@ -1,15 +1,11 @@
 // Tool, proxy and force as they are drawn.
 
+import { BLADE, FORCE, GHOST, HANDLE, PROXY } from './colours.js';
 import {
   BufferAttribute, BufferGeometry, ConeGeometry, CylinderGeometry, Group, Mesh,
   MeshBasicMaterial, MeshPhongMaterial, SphereGeometry, Vector3,
 } from './vendor/three.module.min.js';
 
-const BLADE = 0xc9d2da;
-const HANDLE = 0x3a4552;
-const PROXY = 0x1fb47f;
-const FORCE = 0x56b4e9;
-const GHOST = 0xffd166;
 const METRES_PER_NEWTON = 0.02;
 const MIN_FORCE = 0.02; // [N] below which no arrow is drawn
 const SHAFT = 0.0009, HEAD = 0.0024, HEAD_LENGTH = 0.006; // [m]
