@@ -25,7 +25,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError, check_events, read_bounded
 
-SECTIONS = ('tissue', 'tool', 'device', 'haptics', 'cutting', 'arm', 'session')
+SECTIONS = ('tissue', 'tool', 'device', 'haptics', 'cutting', 'arm', 'session', 'exercise')
 
 
 class SceneModel(BaseModel):

@@ -6,6 +6,7 @@ from pathlib import Path
 from pydantic import Field
 
 from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
 from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
@@ -43,6 +44,7 @@ class Scene:
         name: name of the file, without its extension.
         path: the file.
         profile: limits of the device that the scene names.
+        exercise: the task; without a title the scene is none.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Scene:
     cutting: CuttingSettings
     arm: ArmSettings
     session: SessionSettings
+    exercise: ExerciseSettings
 
 
 def load_scene(scene: str) -> Scene:
@@ -87,6 +90,7 @@ def load_scene(scene: str) -> Scene:
         cutting=read_section(path, 'cutting', CuttingSettings),
         arm=read_section(path, 'arm', ArmSettings),
         session=read_section(path, 'session', SessionSettings),
+        exercise=read_section(path, 'exercise', ExerciseSettings),
     )
 
 
