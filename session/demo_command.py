@@ -57,6 +57,8 @@ class DemoOptions:
         domain: ROS domain, or `free`.
         as_json: print the summary as JSON.
         view: serve a page on this machine with a view of the session.
+        subject: pseudonym of who makes the attempt; empty: not said.
+        notes: remarks on the session.
     """
 
     scene: str
@@ -66,6 +68,8 @@ class DemoOptions:
     domain: int | Literal['free']
     as_json: bool
     view: bool = False
+    subject: str = ''
+    notes: str = ''
 
 
 def run_demo(options: DemoOptions) -> Status:
@@ -77,7 +81,8 @@ def run_demo(options: DemoOptions) -> Status:
     scene = load_scene(options.scene)
     seconds = script_seconds(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)
-    nodes = session_nodes(scene.path, bag, options.seed, seconds)
+    said = {'subject': options.subject, 'notes': options.notes}
+    nodes = session_nodes(scene.path, bag, options.seed, seconds, said)
     if options.view:
         nodes.insert(0, viewer_command(scene.path, LOCAL, page_port(), session=False))
     notes = session_console()

@@ -42,7 +42,9 @@ LOCAL, PORT = '127.0.0.1', 8080
 RANGE, PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
-def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[NodeCommand]:
+def session_nodes(
+    scene: Path, bag: Path, seed: int, seconds: float, attempt: Mapping[str, object] | None = None
+) -> list[NodeCommand]:
     """Return commands for the five nodes.
 
     Args:
@@ -50,6 +52,7 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
         bag: folder of the new bag.
         seed: seed of all random numbers.
         seconds: duration of the arm's script [s].
+        attempt: subject, attempt and notes, parameters of the recorder.
     """
     own: dict[str, dict[str, object]] = {
         ARM_NODE: {'seconds': float(seconds)},
@@ -57,7 +60,7 @@ def session_nodes(scene: Path, bag: Path, seed: int, seconds: float) -> list[Nod
     }
     common = {'scene': str(scene), 'seed': seed}
     commands = [node_command(name, common | own.get(name, {})) for name in SIMULATION]
-    return [*commands, recorder_command(scene, bag, seed)]
+    return [*commands, recorder_command(scene, bag, seed, attempt)]
 
 
 def simulation_nodes(scene: Path, seed: int, checkpoint: Path) -> list[NodeCommand]:

@@ -13,6 +13,7 @@ any score of these people was computed, and not changed after.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -138,7 +139,7 @@ def _is_held(phase: Phase, point: Waypoint) -> bool:
     """Return whether the script itself holds at a waypoint."""
     places = [each.position for each in phase.waypoints]
     return places.count(point.position) > 1 and any(
-        a == b == point.position for a, b in zip(places, places[1:], strict=False)
+        a == b == point.position for a, b in pairwise(places)
     )
 
 

@@ -1,4 +1,4 @@
-"""Attempts in one process, in simulated time: an emulated hand on an emulated arm at an exercise."""
+"""Attempts in one process, in simulated time, by an emulated hand on an emulated arm."""
 
 from dataclasses import dataclass
 
