@@ -54,6 +54,16 @@ SUBJECTS = {
             7: 'it takes minutes: `./trainer validate`',
         },
     ),
+    'training': Subject(
+        modules=('training',),
+        not_covered={
+            1: 'it needs a browser and the page',
+            2: 'in part: all exercises take half an hour: `python -m bench.training -o FILE`',
+            3: 'it needs eyes that have not seen the code',
+            4: 'it needs a browser',
+            5: 'it needs a browser',
+        },
+    ),
     'trust': Subject(
         modules=('trust_bridge', 'trust_output'),
         together=('trust_page', 'trust_files'),
