@@ -15,17 +15,22 @@ import numpy as np
 from cutting_trainer.bags.message_order import Sequence
 from cutting_trainer.bags.reader import Bag, Recorded
 from cutting_trainer.bags.recorded_frames import FrameRecord, Restart, Segment, read_run, runs
-from cutting_trainer.bags.resimulation import LACKS_MEMORY, Resimulation
+from cutting_trainer.bags.resimulation import (
+    LACKS_MEMORY,
+    Resimulation,
+    lacking_contact,
+    recorded_contacts,
+)
 from cutting_trainer.bags.resimulation_start import ComputationStart
 from cutting_trainer.bags.topic_names import INPUTS, MESH, UPDATES
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
-from cutting_trainer.tissue_sim.contact.incoming import tool_contact
 from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica, state_hash
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
-PoseError = Callable[[StampedMessage, Any], float]
-"""Returns the distance [m] of the tool of a contact from the place that a device pose gives."""
+PoseError = Callable[[StampedMessage, Any, int], float]
+"""Returns the distance [m] of the tool of a contact from the place that a device pose gives,
+for the number of the tool."""
 MAX_ROUNDING = 1e-9
 """Largest relative difference that counts as rounding. A difference that matters grows beyond it:
 the computation goes on from its own state, not from the recorded one."""
@@ -236,15 +241,17 @@ def _check_record(
 ) -> None:
     if record.step != step:
         raise _Lacks(f'the bag lacks frame {step}: nothing after it can be computed')
-    if record.has_contact and record.contact is None:
-        raise _Lacks('the bag lacks the contact that loaded this frame: it cannot be computed')
-    if record.has_contact and record.pose is None:
-        comparison.missing['poses of the device'] += 1
-    elif record.pose is not None:
-        comparison.poses += 1
-        if distance := pose_error(record.pose, record.contact):
-            text = f'the pose of the device puts the tool {distance:.3g} m from its contact'
-            raise _Differs(text, distance)
+    if lacks := lacking_contact(record):
+        raise _Lacks(f'{lacks}: it cannot be computed')
+    for number, tool in enumerate(record.by_tool):
+        assert tool is not None
+        if tool.has_contact and tool.pose is None:
+            comparison.missing['poses of the device'] += 1
+        elif tool.pose is not None:
+            comparison.poses += 1
+            if distance := pose_error(tool.pose, tool.contact, number):
+                text = f'the pose of the device puts the tool {distance:.3g} m from its contact'
+                raise _Differs(text, distance)
 
 
 def _check_frame(
@@ -255,17 +262,19 @@ def _check_frame(
         raise (_Lacks if what == LACKS_MEMORY else _Differs)(what)
     simulation = computed.simulation
     try:
-        contact = record.contact and tool_contact(record.contact, simulation.mesh)
+        contacts = recorded_contacts(record, simulation.mesh)
     except ValueError as error:
         raise _Differs(f'the contact that loaded this frame is refused now: {error}') from None
-    frame = computed.frame(contact)
+    frame = computed.frame(*contacts)
     if frame.diverged != record.diverged:
         raise _Differs(f'it {("did not diverge", "diverged")[record.diverged]} when recorded')
-    if record.force is not None:
-        comparison.forces += 1
-        yield from _check_force(frame, simulation.mesh.topology, record.force)
-    elif not record.diverged:
-        comparison.missing['forces of the tissue'] += 1
+    for felt, tool in zip(frame.by_tool, record.by_tool, strict=True):
+        assert tool is not None
+        if tool.force is not None:
+            comparison.forces += 1
+            yield from _check_force(felt, simulation.mesh.topology, tool.force)
+        elif not record.diverged:
+            comparison.missing['forces of the tissue'] += 1
     recorded.follow(record.step)
     if not recorded.known(record.step):
         comparison.missing['meshes'] += 1

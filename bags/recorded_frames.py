@@ -12,7 +12,15 @@ from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.message_order import Sequence
 from cutting_trainer.bags.reader import Bag, Recorded
 from cutting_trainer.bags.recorded_tissue import first_current_keyframe
-from cutting_trainer.bags.topic_names import CONTACT, FORCE, INPUTS, MESH, POSE, of_session
+from cutting_trainer.bags.topic_names import (
+    CONTACT,
+    FORCE,
+    INPUTS,
+    MESH,
+    POSE,
+    further_tools,
+    of_session,
+)
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
@@ -27,13 +35,30 @@ _TRAILING_NS = 100_000_000
 
 
 @dataclass(frozen=True)
+class ToolRecord:
+    """Contact of one tool with a frame, and its reaction.
+
+    Attributes:
+        has_contact: whether a contact loaded the tissue.
+        contact: its message, None where the bag lacks it.
+        pose: the device pose of that contact, None where the bag lacks it.
+        force: `ForceSample` of the frame, None where the bag lacks it.
+    """
+
+    has_contact: bool
+    contact: Any
+    pose: StampedMessage | None
+    force: StampedMessage | None
+
+
+@dataclass(frozen=True)
 class FrameRecord:
     """Recorded inputs and results of one frame.
 
     Attributes:
         step: number of the frame.
         time: when it ended [ns since the epoch].
-        has_contact: whether a contact loaded the tissue.
+        has_contact: whether a contact of the first tool loaded the tissue.
         contact: its message, None where the bag lacks it.
         pose: the device pose of that contact, None where the bag lacks it.
         answer: result of the last requested cut (`CutOutcome`).
@@ -42,6 +67,7 @@ class FrameRecord:
             answer. 0: it was applied on arrival, in bags before format 3.
         diverged: the frame was taken back.
         force: `ForceSample` of the frame, None where the bag lacks it.
+        others: contacts of the further tools, by number; None where the bag lacks their inputs.
     """
 
     step: int
@@ -54,6 +80,13 @@ class FrameRecord:
     answer_frames: int
     diverged: bool
     force: StampedMessage | None
+    others: tuple[ToolRecord | None, ...] = ()
+
+    @property
+    def by_tool(self) -> tuple[ToolRecord | None, ...]:
+        """The contact of each tool."""
+        first = ToolRecord(self.has_contact, self.contact, self.pose, self.force)
+        return (first, *self.others)
 
 
 @dataclass(frozen=True)
@@ -103,7 +136,7 @@ def runs(bag: Bag, messages: Iterable[Recorded]) -> Iterator[tuple[int, Recorded
     run = number = step = -1
     for recorded in messages:
         message = bag.read(recorded)
-        again = recorded.topic == INPUTS and message.step == step
+        again = recorded.topic.endswith(INPUTS) and message.step == step
         if message.step < step or again or 0 < recorded.sequence <= number or run < 0:
             run += 1
         number, step = recorded.sequence, message.step
@@ -132,10 +165,10 @@ def segments(bag: Bag) -> list[Segment]:
     return found
 
 
-def _inputs(bag: Bag) -> Iterator[tuple[int, Recorded, Any]]:
+def _inputs(bag: Bag, tool: str = '') -> Iterator[tuple[int, Recorded, Any]]:
     if INPUTS not in bag.topics():
         raise BagError(f'{bag.path} has no topic {INPUTS}: it is older than format version 2')
-    return runs(bag, Sequence(bag, INPUTS))
+    return runs(bag, Sequence(bag, f'{tool}{INPUTS}'))
 
 
 def last_cut(bag: Bag, number: int) -> int:
@@ -170,31 +203,63 @@ def read_run(bag: Bag, number: int = 0) -> tuple[list[FrameRecord], Restart | No
             break
         if run == number:
             inputs.append(m)
+    others = [
+        _tool_records(bag, [m for run, _, m in _inputs(bag, tool) if run == number], tool)
+        for tool in _by_number(bag, further_tools(bag.topics()))
+    ]
+    first = _tool_records(bag, inputs, '')
+    records = [
+        FrameRecord(
+            step=m.step,
+            time=nanoseconds(m.header.stamp),
+            answer=m.answer,
+            cut_step=m.cut_step,
+            answer_frames=getattr(m, 'answer_frames', 0),
+            diverged=m.diverged,
+            others=tuple(other.get(m.step) for other in others),
+            **vars(first[m.step]),
+        )
+        for m in inputs
+    ]
+    return records, restart
+
+
+def _by_number(bag: Bag, tools: Iterable[str]) -> list[str]:
+    """Return the further tools of a session in the order of their numbers."""
+    numbers = {}
+    for tool in tools:
+        message = next(iter(bag.messages([f'{tool}{INPUTS}'])), None)
+        numbers[tool] = 0 if message is None else bag.read(message).tool
+    return sorted((tool for tool in numbers if numbers[tool]), key=lambda tool: numbers[tool])
+
+
+def _tool_records(bag: Bag, inputs: list[Any], tool: str) -> dict[int, ToolRecord]:
+    """Return the contacts of a tool by frame.
+
+    Args:
+        bag: to read.
+        inputs: its messages of `INPUTS`.
+        tool: its namespace with a slash before it; '': the first.
+    """
     used = {(m.contact_sequence, nanoseconds(m.contact_stamp)) for m in inputs if m.has_contact}
-    contacts = _samples(bag, CONTACT, ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used)
-    pose, wanted = of_session(POSE, bag.topics()), {stamp for _, stamp in used}
+    contacts = _samples(
+        bag, f'{tool}{CONTACT}', ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used
+    )
+    pose, wanted = of_session(f'{tool}{POSE}', bag.topics()), {stamp for _, stamp in used}
     poses = _samples(bag, pose, PoseStampedCodec(), lambda s: s.stamp_ns, wanted)
     stamps = {nanoseconds(m.header.stamp) for m in inputs}
-    forces = _samples(bag, FORCE, ForceSampleCodec(), lambda s: s.stamp_ns, stamps)
-    records = []
+    forces = _samples(bag, f'{tool}{FORCE}', ForceSampleCodec(), lambda s: s.stamp_ns, stamps)
+    found = {}
     for m in inputs:
-        time, stamp = nanoseconds(m.header.stamp), nanoseconds(m.contact_stamp)
+        stamp = nanoseconds(m.contact_stamp)
         contact = contacts.get((m.contact_sequence, stamp)) if m.has_contact else None
-        records.append(
-            FrameRecord(
-                step=m.step,
-                time=time,
-                has_contact=m.has_contact,
-                contact=None if contact is None else contact_message(contact),
-                pose=poses.get(stamp) if m.has_contact else None,
-                answer=m.answer,
-                cut_step=m.cut_step,
-                answer_frames=getattr(m, 'answer_frames', 0),
-                diverged=m.diverged,
-                force=forces.get(time),
-            )
+        found[m.step] = ToolRecord(
+            has_contact=m.has_contact,
+            contact=None if contact is None else contact_message(contact),
+            pose=poses.get(stamp) if m.has_contact else None,
+            force=forces.get(nanoseconds(m.header.stamp)),
         )
-    return records, restart
+    return found
 
 
 def contact_message(sample: StampedMessage) -> Any:

@@ -111,9 +111,9 @@ class Resimulation:
         self._resolve(outcome, result)
         return outcome
 
-    def frame(self, contact: ToolContact | None) -> Frame:
-        """Compute a frame."""
-        frame = self.simulation.frame(contact)
+    def frame(self, *contacts: ToolContact | None) -> Frame:
+        """Compute a frame under the contacts of the tools."""
+        frame = self.simulation.frame(*contacts)
         self.substeps += frame.substeps
         self.diverged += frame.diverged
         if self._cut.ask(frame, self.answer_frames(frame.step)):
@@ -150,10 +150,36 @@ def as_recorded(records: Sequence[FrameRecord], computed: Resimulation) -> Itera
             raise BagError(f'the bag lacks frame {step}: nothing after it can be computed')
         if what := computed.take_answer(record.answer):
             raise BagError(f'frame {record.step} cannot be computed again: {what}')
-        if record.has_contact and record.contact is None:
-            raise BagError(f'the bag lacks the contact of frame {record.step}')
-        mesh = computed.simulation.mesh
-        yield computed.frame(record.contact and tool_contact(record.contact, mesh))
+        if lacks := lacking_contact(record):
+            raise BagError(f'frame {record.step} cannot be computed again: {lacks}')
+        yield computed.frame(*recorded_contacts(record, computed.simulation.mesh))
+
+
+def lacking_contact(record: FrameRecord) -> str:
+    """Return why the contacts of a frame are not all known; '' where they are."""
+    for number, tool in enumerate(record.by_tool):
+        of = f' of tool {number}' if number else ''
+        if tool is None:
+            return f'the bag lacks the inputs{of}'
+        if tool.has_contact and tool.contact is None:
+            return f'the bag lacks the contact{of} that loaded this frame'
+    return ''
+
+
+def recorded_contacts(record: FrameRecord, mesh: TetMesh) -> list[ToolContact | None]:
+    """Return the contact of each tool with a frame.
+
+    Args:
+        record: of the frame, which lacks none of them.
+        mesh: before that frame.
+
+    Raises:
+        MessageError: a contact is refused now.
+    """
+    return [
+        tool_contact(tool.contact, mesh, number) if tool and tool.contact else None
+        for number, tool in enumerate(record.by_tool)
+    ]
 
 
 def answer_frames(records: Sequence[FrameRecord]) -> Callable[[int], int]:

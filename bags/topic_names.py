@@ -18,6 +18,12 @@ REPLAYED = '/replay'
 """Namespace of the topics that replace the device's in a replay."""
 
 
+def further_tools(topics: Collection[str]) -> list[str]:
+    """Return the namespaces of the further tools of a session, `''` not among them."""
+    ends = [topic.removesuffix(INPUTS) for topic in topics if topic.endswith(INPUTS)]
+    return sorted(end for end in ends if end) if INPUTS in topics else []
+
+
 def of_session(topic: str, topics: Collection[str]) -> str:
     """Return a topic of the device, or its replacement in the bag of a replay.
 

@@ -52,10 +52,11 @@ class ContactReport:
         state: of the force path, dtype `force_kernels.STATE`, shape (1,).
         stiffness: of the coupling [N/m].
         radius: of the tool [m].
+        number: of the tool, by its place in the list of the scene.
     """
 
-    def __init__(self, state: np.ndarray, stiffness: float, radius: float) -> None:
-        self._state = state
+    def __init__(self, state: np.ndarray, stiffness: float, radius: float, number: int = 0) -> None:
+        self._state, self._number = state, number
         self._contact = np.zeros(1, _CONTACT)
         self._contact['coupling_stiffness'], self._contact['proxy_radius'] = stiffness, radius
         self._nodes = self._contact['nodes'][0]
@@ -84,7 +85,7 @@ class ContactReport:
             topology,
             *self._nodes.tolist(),
             *self._numbers.tolist(),
-            0,  # the tool's number in the list of the scene
+            self._number,
             mode,
             *self._facing.tolist(),
         )

@@ -36,6 +36,7 @@ class EStop:
         node: to make topics and the service with.
         machine: owner of the latch.
         button: index into `buttons` of `arm/button` that presses it; negative: none.
+        passes_on: press those of the other tools too, by the topic that all share.
 
     Attributes:
         pressed_ns: stamp of the tick that received the last press [ns]; 0 before the first.
@@ -43,10 +44,18 @@ class EStop:
     Limitations: `poll` may run in one thread at a time.
     """
 
-    def __init__(self, node: ManagedNode, machine: OperatingStateMachine, button: int) -> None:
+    def __init__(
+        self,
+        node: ManagedNode,
+        machine: OperatingStateMachine,
+        button: int,
+        *,
+        passes_on: bool = False,
+    ) -> None:
         self.pressed_ns = 0
         self._node, self._machine, self._button = node, machine, button
         self._topic = ros.polled(node, Empty, ros.E_STOP, qos.EVENTS)
+        self._others = node.create_publisher(Empty, ros.E_STOP, qos.EVENTS) if passes_on else None
         self._joy: Any = None
         if button >= 0:
             self._joy = ros.polled(node, Joy, f'{ros.ARM}/button', qos.EVENTS)
@@ -90,6 +99,8 @@ class EStop:
             output.announce(f'{CONTROL_PREFIX}{word}')
             self._said = pressed
         if pressed is not self._published:
+            if pressed and self._others is not None:
+                self._others.publish(Empty())
             self._published = pressed
             self._publisher.publish(Bool(data=pressed))
 

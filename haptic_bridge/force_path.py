@@ -48,6 +48,7 @@ POSE, FORCE = 'arm/measured_cp', 'tissue/force'
 _INVALID = MessageError('marked invalid', 'its stamp is 0')
 _OUTDATED = MessageError('not newer than the one before')
 _AHEAD = MessageError('far ahead of the one before')
+_OTHERS = MessageError('of another tool')
 _NO_TISSUE = MessageError('a blade in the tissue', 'where the surface is not')
 
 
@@ -65,6 +66,7 @@ class ForcePath:
         edge_resistance: largest cutting resistance of the tissue by blade length [N/m].
         friction: of the tool on the tissue.
         steps: in which a crack runs before the blade.
+        number: of the tool, by its place in the list of the scene.
 
     Attributes:
         stale_trips: how often the simulation's data went stale while enabled.
@@ -88,6 +90,7 @@ class ForcePath:
         edge_resistance: float = math.inf,
         friction: Friction = NO_FRICTION,
         steps: Steps = NO_STEPS,
+        number: int = 0,
     ) -> None:
         check_together(tool, device, haptics, profile)
         self.haptics = haptics
@@ -115,7 +118,8 @@ class ForcePath:
         self._grips = friction.sliding > 0.0
         self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
         self._coupling = tool.coupling_stiffness
-        self._report = ContactReport(self._state, tool.coupling_stiffness, tool.radius)
+        self._number = number
+        self._report = ContactReport(self._state, tool.coupling_stiffness, tool.radius, number)
         self._pose = np.zeros(7)
         self._motion = MotionGate()
         self._pose_stamp = self._pose_ns = 0
@@ -289,6 +293,9 @@ class ForcePath:
             self.rejections.add(FORCE, problem)
             extrapolation.clear(self._history)
             return str(problem)
+        if reaction.tool != self._number:
+            self.rejections.add(FORCE, _OTHERS)
+            return ''
         if fresh and reaction.step > self._step + MAX_STEP_AHEAD:
             self.rejections.add(FORCE, _AHEAD)
             return ''

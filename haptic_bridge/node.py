@@ -40,10 +40,15 @@ from cutting_trainer.node_common.operating_state import (
     OperatingStateMachine,
     crtk_types,
 )
-from cutting_trainer.node_common.parameters import parameter, scene_parameter, seed_parameter
+from cutting_trainer.node_common.parameters import (
+    parameter,
+    scene_parameter,
+    seed_parameter,
+    tool_parameter,
+)
 from cutting_trainer.node_common.publishers import PublisherMonitor
 from cutting_trainer.node_common.realtime import prepare, run_real_time
-from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
 from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
@@ -72,6 +77,7 @@ class HapticBridge(ManagedNode):
 
     Parameters:
         scene: path of the scene file.
+        tool: name of its tool in the section `tools`; empty: the first.
         auto_enable: enter ENABLED when device, force and surface are fresh for the first time.
             Never again after that: a FAULT is left by a command only. Never after an E-STOP.
         e_stop_pressed: E-STOP is pressed from the start, as it was when this node died.
@@ -95,14 +101,23 @@ class HapticBridge(ManagedNode):
         seed_parameter(self)
         text = 'enter ENABLED, once, when device, force and surface are fresh'
         wanted = bool(parameter(self, 'auto_enable', False, text))
-        device = read_section(scene, 'device', DeviceSettings)
-        tool = read_section(scene, 'tool', ToolSettings)
-        haptics = read_section(scene, 'haptics', HapticsSettings)
+        name, names = tool_parameter(self), ('', *tool_names(scene))
+        device = read_section(scene, 'device', DeviceSettings, name)
+        tool = read_section(scene, 'tool', ToolSettings, name)
+        haptics = read_section(scene, 'haptics', HapticsSettings, name)
         profile = device.load_profile()
         resistance, friction, steps = of_tissue(scene)
         warm_up(tool, device, haptics, profile, friction)
         self._path = ForcePath(
-            tool, device, haptics, profile, self.rejections, resistance, friction, steps
+            tool,
+            device,
+            haptics,
+            profile,
+            self.rejections,
+            resistance,
+            friction,
+            steps,
+            names.index(name),
         )
         self._machine.start_anew()
         self._auto_enable = AutoEnable(self._machine, wanted=wanted)
@@ -126,7 +141,7 @@ class HapticBridge(ManagedNode):
         self._device = DeviceState(self, ros.ARM, self._machine)
         self._button = HoldButton(self, ros.ARM, self._machine) if device.hold_button else None
         stop_button = -1 if device.e_stop_button is None else device.e_stop_button
-        self._e_stop = EStop(self, self._machine, stop_button)
+        self._e_stop = EStop(self, self._machine, stop_button, passes_on=len(names) > 1)
         types = crtk_types()
         understood = {
             f'{ros.ARM}/operating_state': types.operating_state,

@@ -7,7 +7,7 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
-from cutting_trainer.node_common.rejections import TOOLS, MessageError
+from cutting_trainer.node_common.rejections import MAX_TOOLS, MessageError
 from cutting_trainer.tissue_sim.mesh.replica import MAX_COORDINATE
 
 MAX_FORCE_N = 1e3
@@ -93,7 +93,7 @@ class TissueSample(NamedTuple):
             ('immersed', self.immersed.min(), 1.0, ''),
             ('state', self.state, INSIDE, ''),
             ('topology', self.topology, _MAX_COUNT, ''),
-            ('tool', self.tool, TOOLS - 1, ''),
+            ('tool', self.tool, MAX_TOOLS - 1, ''),
         ):
             if not 0 <= size <= limit:  # a NaN is not
                 text = (

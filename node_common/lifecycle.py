@@ -233,9 +233,14 @@ class ManagedNode(LifecycleNode):
         self._before = {}
 
 
+def name_of(node: Node) -> str:
+    """Return the name of a node for the launcher: with its namespace, without the first slash."""
+    return str(node.get_fully_qualified_name().lstrip('/'))
+
+
 def announce_ready(node: Node) -> None:
     """Report to the launcher, by a line on standard output, that the node is ready."""
-    output.announce(f'ready: {node.get_name()}')
+    output.announce(f'ready: {name_of(node)}')
 
 
 def run(make_node: Callable[[], ManagedNode]) -> Any:
@@ -292,7 +297,7 @@ def _beat(node: ManagedNode, stop: Stop, period: float) -> None:
     while not stop.is_set():
         now = node.signs_of_life
         if now != before and not output.announcing():  # one unread line is enough
-            output.announce(f'beat: {node.get_name()}')
+            output.announce(f'beat: {name_of(node)}')
         before = now
         time.sleep(period)
 

@@ -75,6 +75,12 @@ def scene_parameter(node: Node) -> str:
     )
 
 
+def tool_parameter(node: Node) -> str:
+    """Return the name of the node's tool in the scene's section `tools`, parameter `tool`."""
+    text = "name in the scene's section `tools`; empty: the first tool"
+    return str(parameter(node, 'tool', '', text))
+
+
 def seed_parameter(node: Node) -> int:
     """Return the seed of all random numbers of the node, parameter `seed`."""
     text = 'seed of everything random [-]'

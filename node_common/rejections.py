@@ -13,8 +13,8 @@ MAX_DETAIL_LENGTH, MAX_QUOTED_LENGTH = 300, 60
 hundred megabytes, and reasons go to the log, /diagnostics and operating states."""
 OTHER_REASONS = 'others'
 TISSUE_FRAME = 'tissue'
-TOOLS = 1
-"""Number of tools in a scene. Messages name theirs by its place in the list, from 0."""
+MAX_TOOLS = 4
+"""Largest number of tools in a scene. Messages name theirs by its place in the list, from 0."""
 
 
 class MessageError(ValueError):
@@ -92,12 +92,19 @@ def require_frame(topic: str, frame: str) -> None:
         raise MessageError('wrong frame', text)
 
 
-def require_tool(name: str, tool: float) -> None:
-    """Raise if a message is about a tool that the scene does not have.
+def require_tool(name: str, tool: float, own: int | None = None) -> None:
+    """Raise if a message is about a tool that no scene has, or about another than its topic's.
+
+    Args:
+        name: of the message.
+        tool: number in it.
+        own: number of the tool that the topic belongs to; None: any.
 
     Raises:
         MessageError: the reason and the number.
     """
-    if tool >= TOOLS:
-        text = f'tool {tool:g} of {name}: the scene has {TOOLS}, and the first is tool 0'
+    if tool >= MAX_TOOLS:
+        text = f'tool {tool:g} of {name}: a scene has {MAX_TOOLS} at most, from 0'
         raise MessageError('no such tool', text)
+    if own is not None and tool != own:
+        raise MessageError('no such tool', f'tool {tool:g} of {name}: its topic is of tool {own}')

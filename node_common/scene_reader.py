@@ -8,6 +8,7 @@ derived from `SceneModel` and reads it with `read_section`. YAML 1.2 applies: `1
 import difflib
 import functools
 import json
+import re
 import types
 import typing
 from collections.abc import Iterable, Iterator
@@ -23,9 +24,21 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.node_common.rejections import MAX_TOOLS
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError, check_events, read_bounded
 
 SECTIONS = ('tissue', 'tool', 'device', 'haptics', 'cutting', 'arm', 'session', 'exercise')
+TOOLS = 'tools'
+"""Section of the further tools in the tissue, by the namespace of their bridge and arm. The keys of
+each replace those of the sections of the first tool."""
+OF_A_TOOL = ('tool', 'device', 'haptics', 'arm')
+"""Sections that a further tool may change."""
+_TOOL_NAME = re.compile(r'[a-z][a-z0-9_]{0,31}')
+_TAKEN = (
+    *('tissue', 'tool', 'arm', 'cutting', 'viewer', 'recorder', 'replay', 'diagnostics'),
+    *('haptic_bridge', 'emulated_arm', 'tissue_sim', 'tf_static', 'rosout', 'parameter_events'),
+)
+"""Names of nodes and topics, which a namespace would be confused with."""
 
 
 class SceneModel(BaseModel):
@@ -52,7 +65,7 @@ ScenePath = Annotated[Path, AfterValidator(_existing_file)]
 """Path of an existing file; in a scene it is relative to the scene file."""
 
 
-def read_section(path: Path, section: str, model: type[M]) -> M:
+def read_section(path: Path, section: str, model: type[M], tool: str = '') -> M:
     """Read and check one section of a scene file.
 
     A missing or empty section has the defaults of its model.
@@ -61,6 +74,7 @@ def read_section(path: Path, section: str, model: type[M]) -> M:
         path: the scene file.
         section: one of `SECTIONS`.
         model: model of the section, preferably derived from `SceneModel`.
+        tool: name of a further tool, with its own keys in place of the first one's; '': the first.
 
     Raises:
         SceneError: one sentence with file, line, key, value and remedy.
@@ -68,6 +82,8 @@ def read_section(path: Path, section: str, model: type[M]) -> M:
     root = _compose(path)
     document = _plain(root, path, ())
     _check_sections(root, path)
+    if tool:
+        root, document = _as_of_tool(root, document, path, section, tool)
     content = document.get(section)
     try:
         return model.model_validate_json(
@@ -80,6 +96,46 @@ def read_section(path: Path, section: str, model: type[M]) -> M:
             raise SceneError(_missing_section(path, section, error)) from None
         place = _Place(path, section, _child(root, section) or root, model)
         raise SceneError(_most_helpful(place, error.errors())) from None
+
+
+def tool_names(path: Path) -> tuple[str, ...]:
+    """Return the names of the further tools of a scene, in their order; (): it has one tool.
+
+    Raises:
+        SceneError: one sentence with file, line, key, value and remedy.
+    """
+    root = _compose(path)
+    _plain(root, path, ())
+    _check_sections(root, path)
+    return tuple(str(key.value) for key, _ in _pairs(_child(root, TOOLS)))
+
+
+def _as_of_tool(
+    root: MappingNode, document: dict[str, Any], path: Path, section: str, tool: str
+) -> tuple[MappingNode, dict[str, Any]]:
+    """Return a scene with one section as a further tool has it."""
+    names = list(document.get(TOOLS) or {})
+    if tool not in names:
+        known = ', '.join(names) or 'none'
+        raise SceneError(f'{path}: section {TOOLS} has no {tool!r:.60}: known are {known}')
+    own = _child(root, TOOLS)
+    changes = None if own is None else _child(own, tool)
+    pairs = _pairs(None if changes is None else _child(changes, section))
+    if not pairs:
+        return root, document
+    before = _child(root, section)
+    changed = {str(key.value) for key, _ in pairs}
+    kept = [(k, v) for k, v in _pairs(before) if str(k.value) not in changed]
+    made = MappingNode('tag:yaml.org,2002:map', [*kept, *pairs], pairs[0][0].start_mark)
+    others = [(k, v) for k, v in root.value if str(k.value) != section]
+    key = ScalarNode('tag:yaml.org,2002:str', section, pairs[0][0].start_mark)
+    merged = MappingNode(root.tag, [*others, (key, made)], root.start_mark)
+    return merged, document | {section: _plain(made, path, (section,))}
+
+
+def _pairs(node: Node | None) -> list[tuple[Node, Node]]:
+    """Return the keys and values of a mapping; [] of what is none, as an empty section."""
+    return list(node.value) if isinstance(node, MappingNode) else []
 
 
 def missing_file(path: Path) -> str:
@@ -198,17 +254,57 @@ def _plain(node: Node, path: Path, keys: tuple[str, ...], above: tuple[Node, ...
 
 def _check_sections(root: MappingNode, path: Path) -> None:
     for key_node, value_node in root.value:
-        section = str(key_node.value)
-        if section not in SECTIONS:
-            near = nearest(section, SECTIONS)
-            hint = f'did you mean {near}?' if near else f'known are {", ".join(SECTIONS)}'
+        section, known = str(key_node.value), (*SECTIONS, TOOLS)
+        if section not in known:
+            near = nearest(section, known)
+            hint = f'did you mean {near}?' if near else f'known are {", ".join(known)}'
             raise SceneError(f'{path}:{_line(key_node)}: {section} is not a section: {hint}')
-        empty = isinstance(value_node, ScalarNode) and str(value_node.tag).endswith(':null')
-        if not empty and not isinstance(value_node, MappingNode):
+        if not _is_empty(value_node) and not isinstance(value_node, MappingNode):
             raise SceneError(
                 f'{path}:{_line(value_node)}: section {section} is a {_kind(value_node)}: it must '
                 'be a mapping of keys to values'
             )
+        if section == TOOLS:
+            _check_tools(value_node, path)
+
+
+def _check_tools(node: Node, path: Path) -> None:
+    """Refuse further tools whose names or sections no session could have."""
+    tools = _pairs(node)
+    if len(tools) >= MAX_TOOLS:
+        raise SceneError(
+            f'{path}:{_line(node)}: {TOOLS} has {len(tools)} further tools: at most '
+            f'{MAX_TOOLS - 1} fit beside the first'
+        )
+    for name_node, content in tools:
+        name, where = str(name_node.value), f'{path}:{_line(name_node)}: {TOOLS}'
+        if not _TOOL_NAME.fullmatch(name):
+            raise SceneError(
+                f'{where} has {_short(name)}: a tool is named by a ROS namespace, such as grasper: '
+                'lower-case letters, digits and underscores'
+            )
+        if name in _TAKEN:
+            raise SceneError(f'{where}.{name}: a topic or node has this name: choose another')
+        if not isinstance(content, MappingNode) and not _is_empty(content):
+            raise SceneError(
+                f'{where}.{name} is a {_kind(content)}: it must be a mapping of the sections '
+                f'{", ".join(OF_A_TOOL)}'
+            )
+        for key, value in _pairs(content):
+            section = str(key.value)
+            where = f'{path}:{_line(key)}: {TOOLS}.{name}.{section}'
+            if section not in OF_A_TOOL:
+                near = nearest(section, OF_A_TOOL)
+                hint = f'did you mean {near}?' if near else f'known are {", ".join(OF_A_TOOL)}'
+                raise SceneError(f'{where} is not a section of a tool: {hint}')
+            if not isinstance(value, MappingNode) and not _is_empty(value):
+                raise SceneError(
+                    f'{where} is a {_kind(value)}: it must be a mapping of keys to values'
+                )
+
+
+def _is_empty(node: Node) -> bool:
+    return isinstance(node, ScalarNode) and str(node.tag).endswith(':null')
 
 
 def _missing_section(path: Path, section: str, error: ValidationError) -> str:

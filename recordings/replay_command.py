@@ -19,7 +19,14 @@ from cutting_trainer.bags.playback_publishers import HandPlayer, Player, Session
 from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.recorded_frames import first_keyframe
 from cutting_trainer.bags.recorded_tissue import first_current_keyframe
-from cutting_trainer.bags.topic_names import BUTTON, FORCES, OF_TISSUE, POSE, REPLAYED
+from cutting_trainer.bags.topic_names import (
+    BUTTON,
+    FORCES,
+    OF_TISSUE,
+    POSE,
+    REPLAYED,
+    further_tools,
+)
 from cutting_trainer.node_common.realtime import prepare
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.session.demo_command import new_bag
@@ -120,6 +127,10 @@ def _show(options: ReplayOptions, bag: Bag, context: Context, end: float) -> Sta
 
 
 def _drive(options: ReplayOptions, bag: Bag, context: Context, domain: int) -> Status:
+    if further_tools(bag.topics()):
+        raise SessionError(
+            f'{bag.path} has several tools, and a replay moves one: add --as-recorded'
+        )
     hand = RecordedHand(bag)
     begin, end = max(options.start, hand.span[0]), hand.span[1]
     if begin >= end:

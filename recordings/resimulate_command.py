@@ -5,8 +5,9 @@ import math
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,12 +84,13 @@ def recomputation(
         )
     method = make_method(scene.cutting)
     if beginning is None or beginning.tissue is None:
-        return Resimulation(make_simulation(scene.tissue)[0], method)
+        return Resimulation(make_simulation(scene.tissue, tools=len(scene.tools))[0], method)
     warm_up_method(scene.tissue.integrator)
     try:
         simulation = from_state(beginning.tissue)
         if changed:
-            simulation, _ = make_simulation(scene.tissue, shape_of(simulation))
+            shape = shape_of(simulation)
+            simulation, _ = make_simulation(scene.tissue, shape, tools=len(scene.tools))
             return Resimulation(simulation, method)
         computed = Resimulation(simulation, method)
         computed.lacks_memory = beginning.cutting is None
@@ -103,13 +105,16 @@ def recomputation(
     return computed
 
 
-def pose_check(scene: Scene) -> Callable[[Any, Any], float]:
+def pose_check(scene: Scene) -> Callable[[Any, Any, int], float]:
     """Return a function for the distance [m] between the tool of a contact and of a device pose."""
-    setup = force_kernels.make_setup(scene.tool, scene.device, scene.haptics, scene.profile)
+    setups = [
+        force_kernels.make_setup(one.tool, one.device, one.haptics, one.profile)
+        for one in scene.tools
+    ]
     state = np.zeros(1, force_kernels.STATE)
 
-    def distance(pose: Any, contact: Any) -> float:
-        force_kernels.to_tissue(setup, state, np.array(pose.values))
+    def distance(pose: Any, contact: Any, number: int) -> float:
+        force_kernels.to_tissue(setups[number], state, np.array(pose.values))
         root, tip = state[0]['blade']
         pairs = (
             (state[0]['tip'], contact.device),
@@ -137,7 +142,9 @@ def _verify(bag: Bag, scene: Scene, *, as_json: bool) -> Status:
         took = time.monotonic() - began
     code = recorded_code(bag.custom_data)
     if as_json:
-        report = asdict(result) | {'identical': result.identical, 'computed_in': took}
+        # asdict of Python 3.11 makes pairs the keys of a Counter.
+        report = asdict(replace(result, missing=Counter())) | {'missing': dict(result.missing)}
+        report |= {'identical': result.identical, 'computed_in': took}
         report['code'] = {
             'bag': code and asdict(code),
             'here': asdict(identity_here()),

@@ -247,6 +247,11 @@ def computable_poses(bag: Bag) -> tuple[list[FrameRecord], list[StampedMessage]]
         for recorded in bag.messages([topic])
         if recorded.log_time >= beginning.segment.since
     )
+    if any(record.others for record in records):
+        raise SessionError(
+            f'{bag.path} has several tools: their hands cannot be moved anew in a changed scene; '
+            'resimulate it without --with'
+        )
     poses = [pose for pose in decoded if after < pose.stamp_ns <= until]
     if not poses:
         raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')

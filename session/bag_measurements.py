@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 
 from cutting_trainer.bags.message_loss import SequenceCounter
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.bags.topic_names import CONTACT, DIAGNOSTICS, SERVO_CF, of_session
+from cutting_trainer.bags.topic_names import (
+    CONTACT,
+    DIAGNOSTICS,
+    SERVO_CF,
+    further_tools,
+    of_session,
+)
 from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
 from cutting_trainer.session.node_commands import MODULES
 
-SHARED_TOPICS = (DIAGNOSTICS, '/parameter_events', '/rosout')
+SHARED_TOPICS = (DIAGNOSTICS, '/parameter_events', '/rosout', '/haptic_bridge/e_stop')
 """Topics with one publisher per node, and so with several sequences of messages."""
 NANOSECOND_S = 1e-9
 
@@ -80,7 +86,8 @@ def read_evidence(folder: Path) -> Evidence:
     """
     bag = open_bag(folder)
     evidence = Evidence(folder, complete=bag.complete)
-    counters = {t: SequenceCounter(partial(_count_publishers, t)) for t in bag.topics()}
+    nodes = len(MODULES) + 2 * len(further_tools(bag.topics()))
+    counters = {t: SequenceCounter(partial(_count_publishers, t, nodes)) for t in bag.topics()}
     state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
     contact_codec, wrench_codec = ContactCodec(), WrenchStampedCodec()
     contacts, forces = [], []
@@ -107,8 +114,8 @@ def read_evidence(folder: Path) -> Evidence:
     return evidence
 
 
-def _count_publishers(topic: str) -> int:
-    return len(MODULES) if topic in SHARED_TOPICS else 1
+def _count_publishers(topic: str, nodes: int) -> int:
+    return nodes if topic in SHARED_TOPICS else 1
 
 
 def _statuses(array: Any, time: float) -> list[Status]:

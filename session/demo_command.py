@@ -81,8 +81,9 @@ def run_demo(options: DemoOptions) -> Status:
     scene = load_scene(options.scene)
     seconds = script_seconds(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)
+    tools = [tool.label for tool in scene.others]
     said = {'subject': options.subject, 'notes': options.notes}
-    nodes = session_nodes(scene.path, bag, options.seed, seconds, said)
+    nodes = session_nodes(scene.path, bag, options.seed, seconds, tools, said)
     if options.view:
         nodes.insert(0, viewer_command(scene.path, LOCAL, page_port(), session=False))
     notes = session_console()
@@ -123,13 +124,12 @@ def conclude(outcome: Outcome, bag: Path, expected: Expected, *, as_json: bool) 
 
 def expectations(scene: Scene) -> Expected:
     """Return the expectations of a scene: rates, and whether it cuts."""
-    rates = {
-        TISSUE_NODE: scene.tissue.integration.rate,
-        BRIDGE_NODE: scene.haptics.rate,
-        ARM_NODE: scene.arm.rate,
-    }
-    script = scene.arm.script
-    return Expected(rates, cut=script is not None and script.cuts)
+    rates = {TISSUE_NODE: scene.tissue.integration.rate}
+    for tool in scene.tools:
+        prefix = f'{tool.label}/' if tool.label else ''
+        rates |= {prefix + BRIDGE_NODE: tool.haptics.rate, prefix + ARM_NODE: tool.arm.rate}
+    scripts = [tool.arm.script for tool in scene.tools]
+    return Expected(rates, cut=any(script is not None and script.cuts for script in scripts))
 
 
 def page_port() -> int:
@@ -147,14 +147,15 @@ def script_seconds(scene: Scene, asked: float | None) -> float:
     Raises:
         SessionError, SettingsError: it is out of range, or the hand would be too fast.
     """
-    script, seconds = scene.arm.require_script(), asked
+    scripts, seconds = [tool.arm.require_script() for tool in scene.tools], asked
     if seconds is None:
-        seconds = scene.session.seconds or script.seconds
+        seconds = scene.session.seconds or max(script.seconds for script in scripts)
     elif not MIN_DURATION_S <= seconds <= MAX_DURATION_S:
         raise SessionError(
             f'--seconds is {seconds:g}: give a number from {MIN_DURATION_S:g} to {MAX_DURATION_S:g}'
         )
-    compile_script(script, scene.device.tissue_from_device, seconds)
+    for tool, script in zip(scene.tools, scripts, strict=True):
+        compile_script(script, tool.device.tissue_from_device, seconds)
     return seconds
 
 
@@ -215,7 +216,7 @@ def run_nodes(
         if supervisor.start():
             supervisor.run(
                 seconds + MAX_OVERTIME_S,
-                until_done=ARM_NODE,
+                until_done=[c.name for c in nodes if c.name.rpartition('/')[2] == ARM_NODE],
                 tick=lambda elapsed: progress.tick(elapsed, seconds),
             )
         return supervisor.end()

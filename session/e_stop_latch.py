@@ -25,21 +25,38 @@ class EStopState:
         keys: read the terminal's keys.
 
     Attributes:
-        pressed: last known state.
         keys: keys of the terminal; a context manager.
-        is_owed: pressed, but no node has confirmed it yet.
+
+    Each tool has a bridge with a latch of its own. A press is for all, and each is reset alone.
     """
 
     def __init__(self, commands: Sequence[NodeCommand], *, keys: bool = True) -> None:
-        self.pressed = False
-        self.keys = Keys(active=keys and any(command.e_stop_arguments for command in commands))
-        self.is_owed = False
+        self._latches = {command.name for command in commands if command.e_stop_arguments}
+        self.keys = Keys(active=keys and bool(self._latches))
+        self._pressed: set[str] = set()
+        self._owed: set[str] = set()
         self._next = 0.0
 
+    @property
+    def pressed(self) -> bool:
+        """Last known state: whether it holds at a node, or is requested."""
+        return bool(self._pressed or self._owed)
+
+    @property
+    def is_owed(self) -> bool:
+        """Whether a node has not confirmed a request yet."""
+        return bool(self._owed)
+
     def ask(self) -> None:
-        """Press E-STOP. The request is repeated until a node confirms it."""
-        self.pressed = self.is_owed = True
+        """Press E-STOP. The request is repeated until every node confirms it."""
+        self._owed |= self._latches
         self._next = 0.0
+
+    def watch(self, commands: Sequence[NodeCommand]) -> None:
+        """Forget the nodes that are no longer among those of the session."""
+        self._latches = {command.name for command in commands if command.e_stop_arguments}
+        self._pressed &= self._latches
+        self._owed &= self._latches
 
     def poll(self) -> bool:
         """Read the keys; return whether the request must be sent to the nodes now."""
@@ -55,14 +72,17 @@ class EStopState:
         """Return whether a node's line is about E-STOP, and store the state that it reports."""
         if not command.e_stop_arguments or line not in (PRESSED, RELEASED):
             return False
-        self.is_owed &= line == RELEASED  # the node wrote it before it received the request
-        self.pressed = line == PRESSED or self.is_owed
+        if line == PRESSED:
+            self._owed.discard(command.name)
+            self._pressed.add(command.name)
+        else:  # of a node that is owed the request: it wrote this before it received that
+            self._pressed.discard(command.name)
         return True
 
     def start_command(self, command: NodeCommand) -> NodeCommand:
         """Return the command with the arguments for the present state of E-STOP."""
         return (
             replace(command, argv=command.argv + command.e_stop_arguments)
-            if self.pressed
+            if command.name in self._pressed | self._owed
             else command
         )

@@ -27,6 +27,10 @@ SIMULATION = (ARM_NODE, BRIDGE_NODE, TISSUE_NODE, CUTTING_NODE)
 """Nodes of a session, without those that only subscribe."""
 SESSION_PUBLISHERS = f'/{ARM_NODE},/{TISSUE_NODE}'
 """Publishers of poses, forces and meshes in a session with the emulated arm."""
+OF_A_TOOL = (ARM_NODE, BRIDGE_NODE)
+"""Nodes that each tool has."""
+SHARED = ('tissue/mesh', 'tissue/mesh_updates', 'tissue/get_mesh', 'haptic_bridge/e_stop')
+"""Topics and services of the graph that the bridge of a further tool uses."""
 RESTART_PARAMETERS: dict[str, dict[str, object]] = {
     BRIDGE_NODE: {'auto_enable': False},
     TISSUE_NODE: {'resume': True},
@@ -43,15 +47,21 @@ RANGE, PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FI
 
 
 def session_nodes(
-    scene: Path, bag: Path, seed: int, seconds: float, attempt: Mapping[str, object] | None = None
+    scene: Path,
+    bag: Path,
+    seed: int,
+    seconds: float,
+    tools: Sequence[str] = (),
+    attempt: Mapping[str, object] | None = None,
 ) -> list[NodeCommand]:
-    """Return commands for the five nodes.
+    """Return commands for the five nodes, and arm and bridge of each further tool.
 
     Args:
         scene: scene file of all nodes.
         bag: folder of the new bag.
         seed: seed of all random numbers.
         seconds: duration of the arm's script [s].
+        tools: names of the further tools of the scene.
         attempt: subject, attempt and notes, parameters of the recorder.
     """
     own: dict[str, dict[str, object]] = {
@@ -59,17 +69,20 @@ def session_nodes(
         BRIDGE_NODE: {'auto_enable': True, 'accepted_publishers': SESSION_PUBLISHERS},
     }
     common = {'scene': str(scene), 'seed': seed}
-    commands = [node_command(name, common | own.get(name, {})) for name in SIMULATION]
+    commands = _nodes(common, own, tools)
     return [*commands, recorder_command(scene, bag, seed, attempt)]
 
 
-def simulation_nodes(scene: Path, seed: int, checkpoint: Path) -> list[NodeCommand]:
+def simulation_nodes(
+    scene: Path, seed: int, checkpoint: Path, tools: Sequence[str] = ()
+) -> list[NodeCommand]:
     """Return commands for a session that waits for its operator, without script and force.
 
     Args:
         scene: scene file of all nodes.
         seed: seed of all random numbers.
         checkpoint: file of the tissue's state.
+        tools: names of the further tools of the scene.
     """
     common = {'scene': str(scene), 'seed': seed}
     own: dict[str, dict[str, object]] = {
@@ -77,7 +90,40 @@ def simulation_nodes(scene: Path, seed: int, checkpoint: Path) -> list[NodeComma
         BRIDGE_NODE: {'accepted_publishers': SESSION_PUBLISHERS},
         TISSUE_NODE: {'checkpoint': str(checkpoint)},
     }
-    return [node_command(name, common | own.get(name, {})) for name in SIMULATION]
+    return _nodes(common, own, tools)
+
+
+def _nodes(
+    common: Mapping[str, object], own: Mapping[str, Mapping[str, object]], tools: Sequence[str]
+) -> list[NodeCommand]:
+    """Return commands for the nodes of a simulation.
+
+    Args:
+        common: parameters of all nodes.
+        own: further ones by node.
+        tools: names of the further tools of the scene.
+    """
+    commands = [node_command(name, {**common, **own.get(name, {})}) for name in SIMULATION]
+    first = [tool_command(t, n, {**common, **own.get(n, {})}) for t in tools for n in OF_A_TOOL]
+    return [*first, *commands]
+
+
+def tool_command(tool: str, name: str, parameters: Mapping[str, object]) -> NodeCommand:
+    """Return the command of the arm or bridge of a further tool, which are in its namespace.
+
+    Mesh and E-STOP are those of all tools.
+
+    Args:
+        tool: its name.
+        name: one of `OF_A_TOOL`.
+        parameters: as those of the first tool.
+    """
+    given = {**parameters, 'tool': tool}
+    if accepted := str(given.get('accepted_publishers', '')):
+        given['accepted_publishers'] = accepted.replace(f'/{ARM_NODE}', f'/{tool}/{ARM_NODE}')
+    shared = {topic: f'/{topic}' for topic in SHARED if name == BRIDGE_NODE}
+    command = node_command(name, given, {'__ns': f'/{tool}', **shared})
+    return replace(command, name=f'{tool}/{name}')
 
 
 def bridge_side_nodes(

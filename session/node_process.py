@@ -29,7 +29,7 @@ class NodeCommand:
     """Command of a node.
 
     Attributes:
-        name: name of the node, as in its line `ready: NAME`.
+        name: name of the node with its namespace, as in its line `ready: NAME`.
         argv: program and arguments.
         records: it records the others. It starts before them and ends after them. It gets SIGTERM,
             not SIGKILL, when the launcher dies, and keeps its grace after a second interrupt.

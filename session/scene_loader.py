@@ -16,7 +16,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     ToolSettings,
     check_together,
 )
-from cutting_trainer.node_common.scene_reader import SceneModel, nearest, read_section
+from cutting_trainer.node_common.scene_reader import SceneModel, nearest, read_section, tool_names
 from cutting_trainer.node_common.share_folder import share_folder
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
@@ -37,6 +37,23 @@ class SessionSettings(SceneModel):
 
 
 @dataclass(frozen=True)
+class SceneTool:
+    """One tool of a scene, with its device.
+
+    Attributes:
+        label: namespace of its bridge and arm; '': the first tool, which has none.
+        profile: limits of the device that the scene names.
+    """
+
+    label: str
+    tool: ToolSettings
+    device: DeviceSettings
+    profile: DeviceProfile
+    haptics: HapticsSettings
+    arm: ArmSettings
+
+
+@dataclass(frozen=True)
 class Scene:
     """Content of a scene file.
 
@@ -45,6 +62,7 @@ class Scene:
         path: the file.
         profile: limits of the device that the scene names.
         exercise: the task; without a title the scene is none.
+        others: the further tools, in their order.
     """
 
     name: str
@@ -58,6 +76,13 @@ class Scene:
     arm: ArmSettings
     session: SessionSettings
     exercise: ExerciseSettings
+    others: tuple[SceneTool, ...] = ()
+
+    @property
+    def tools(self) -> tuple[SceneTool, ...]:
+        """All tools, the first one first."""
+        first = SceneTool('', self.tool, self.device, self.profile, self.haptics, self.arm)
+        return (first, *self.others)
 
 
 def load_scene(scene: str) -> Scene:
@@ -71,27 +96,35 @@ def load_scene(scene: str) -> Scene:
         SceneError, SettingsError: a value of the file is not valid.
     """
     path = find_scene(scene)
-    tool = read_section(path, 'tool', ToolSettings)
-    device = read_section(path, 'device', DeviceSettings)
-    haptics = read_section(path, 'haptics', HapticsSettings)
-    try:
-        profile = device.load_profile()
-        check_together(tool, device, haptics, profile)
-    except SettingsError as error:
-        raise SettingsError(f'{path}: {error}') from None
+    first = _load_tool(path, '')
     return Scene(
         name=path.stem,
         path=path,
         tissue=read_section(path, 'tissue', TissueSettings),
-        tool=tool,
-        device=device,
-        profile=profile,
-        haptics=haptics,
+        tool=first.tool,
+        device=first.device,
+        profile=first.profile,
+        haptics=first.haptics,
         cutting=read_section(path, 'cutting', CuttingSettings),
-        arm=read_section(path, 'arm', ArmSettings),
+        arm=first.arm,
         session=read_section(path, 'session', SessionSettings),
         exercise=read_section(path, 'exercise', ExerciseSettings),
+        others=tuple(_load_tool(path, name) for name in tool_names(path)),
     )
+
+
+def _load_tool(path: Path, label: str) -> SceneTool:
+    tool = read_section(path, 'tool', ToolSettings, label)
+    device = read_section(path, 'device', DeviceSettings, label)
+    haptics = read_section(path, 'haptics', HapticsSettings, label)
+    try:
+        profile = device.load_profile()
+        check_together(tool, device, haptics, profile)
+    except SettingsError as error:
+        where = f'{path}: tools.{label}' if label else f'{path}'
+        raise SettingsError(f'{where}: {error}') from None
+    arm = read_section(path, 'arm', ArmSettings, label)
+    return SceneTool(label, tool, device, profile, haptics, arm)
 
 
 def find_scene(scene: str, folder: Path = SCENES) -> Path:

@@ -143,6 +143,7 @@ class Supervisor:
         self.remove([command.name for command in commands])
         self.outcome.unready = ''
         self._commands = [*self._commands, *commands]
+        self.e_stop.watch(self._commands)
         return self._start_all(commands, timeout)
 
     def remove(self, names: Collection[str]) -> None:
@@ -185,14 +186,15 @@ class Supervisor:
         self,
         seconds: float,
         *,
-        until_done: str = '',
+        until_done: Collection[str] = (),
         tick: Callable[[float], object] = lambda elapsed: None,
     ) -> None:
         """Supervise the session until its end; after a death the other nodes go on.
 
         Args:
             seconds: longest duration [s].
-            until_done: node whose line `done: NAME` ends the session.
+            until_done: nodes whose lines `done: NAME` end the session, once all of them that live
+                have written it.
             tick: called often with the elapsed time [s]; the session ends when it returns False.
         """
         assert self._began is not None, 'start() first'
@@ -203,8 +205,10 @@ class Supervisor:
             elapsed = time.monotonic() - self._began
             if tick(elapsed) is False:
                 break
-            if until_done in self._nodes and self._nodes[until_done].done:
-                self.outcome.finished = True
+            awaited = [self._nodes[name] for name in until_done if name in self._nodes]
+            done = [node for node in awaited if node.done]
+            if done and all(node.done or not node.alive for node in awaited):
+                self.outcome.finished = len(done) == len(awaited)
                 break
         self.outcome.seconds = elapsed
 
@@ -240,7 +244,9 @@ class Supervisor:
 
     def _start(self, command: NodeCommand) -> None:
         command = self.e_stop.start_command(command)
-        node = NodeProcess(command, self._logs / f'{command.name}.log', self._environment)
+        node = NodeProcess(
+            command, self._logs / f'{command.name.replace("/", ".")}.log', self._environment
+        )
         self._nodes[command.name] = node
         self._selector.register(node.pipe, selectors.EVENT_READ, node)
 

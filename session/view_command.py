@@ -147,7 +147,9 @@ class _Session:
 
     def nodes(self) -> list[NodeCommand]:
         """Return the commands of the nodes that restart together."""
-        return simulation_nodes(self._file, self._options.seed, self._folder / 'tissue.checkpoint')
+        tools = [tool.label for tool in self._scene.others]
+        checkpoint = self._folder / 'tissue.checkpoint'
+        return simulation_nodes(self._file, self._options.seed, checkpoint, tools)
 
     def event_handler(self, progress: SessionProgress) -> Callable[[Event], None]:
         """Return a handler of the supervisor's events."""
@@ -217,10 +219,13 @@ class _Session:
         if recorded:
             supervisor.remove([RECORDER_NODE])
             self._recording = None
+        before = [command.name for command in self.nodes()]
         self._scene, self._method = scene, method
         self._file = write_changed(scene, self._folder, changes) if changes else scene.path
         self._is_new = True  # the file may have changed under the same name
-        if not supervisor.replace(self.nodes()):
+        nodes = self.nodes()
+        supervisor.remove(set(before) - {command.name for command in nodes})
+        if not supervisor.replace(nodes):
             outcome = supervisor.outcome
             why = outcome.unready or (outcome.deaths[-1].sentence if outcome.deaths else '')
             raise SessionError(why or 'the start was interrupted')

@@ -13,7 +13,6 @@ import numpy as np
 from bench.page.browser import Page
 
 ROOT = Path(__file__).resolve().parents[1]
-UP, RIGHT = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 
 
 def sessions() -> set[Path]:
@@ -57,10 +56,37 @@ class View:
         return self.process.wait(60)
 
 
-def way(start: np.ndarray, axis: np.ndarray, length: float) -> np.ndarray:
-    """Places from where the blade is to `length` further along an axis [m], shape (n, 3)."""
-    shares = np.concatenate([[0.0, 0.02], np.linspace(0.1, 1.0, 8)])
-    return start + np.outer(shares * length, axis)
+def point(page: Page, place: np.ndarray) -> None:
+    """Lets the blade come over a place of the tissue [m]."""
+    start(page)
+    page.wait(lambda: page.state()['canGuide'], 'the hand')
+    x, y = page.pixels(place[None])[0]
+    for beside in (6.0, 3.0, 0.0):
+        page.mouse('mouseMoved', x + beside, y)
+        time.sleep(0.1)
+    time.sleep(1.0)
+
+
+def cut(page: Page, begin: np.ndarray, end: np.ndarray, notches: int = 0) -> None:
+    """Cuts from one place of the surface to another [m], the button held.
+
+    Args:
+        page: to use.
+        begin: of the cut.
+        end: of it.
+        notches: of the wheel, each 0.5 mm deeper than 6 mm.
+    """
+    point(page, begin)
+    places = page.pixels(np.linspace(begin, end, 12))
+    page.mouse('mousePressed', *places[0], pressed=True)
+    x, y = places[0]
+    for _ in range(notches):
+        page.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0, deltaY=120)
+    time.sleep(1.0)
+    for place in places[1:]:
+        page.mouse('mouseMoved', *place, pressed=True)
+        time.sleep(0.1)
+    time.sleep(0.7)
 
 
 def reddish(picture: np.ndarray) -> np.ndarray:

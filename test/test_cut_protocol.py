@@ -209,11 +209,13 @@ def lived(
     cutting = Cutting(clock, simulation, scene, delays)
     node._loop = Loop(clock, len(records), stop)
     node._cuts._client = cutting
-    node._newest_contact = lambda: contact_of(records[simulation.step], simulation)
+    (tool,) = node._tools
+    contact = lambda mesh: contact_of(records[simulation.step], simulation)  # noqa: E731
+    monkeypatch.setattr(tool, 'contact', contact)
     forces: list[ForceSample] = []
     inputs: list[FrameInputs] = []
-    monkeypatch.setattr(node._forces, 'publish', forces.append)
-    monkeypatch.setattr(node._inputs, 'publish', inputs.append)
+    monkeypatch.setattr(tool._forces, 'publish', forces.append)
+    monkeypatch.setattr(tool._inputs, 'publish', inputs.append)
     node.work(stop)
     session = Lived([sample.force for sample in forces], simulation)
     session.inputs, session.commands = inputs, cutting.commands

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -113,13 +114,14 @@ BESIDE = (
 def made() -> set[tuple[str, str]]:
     """Names and short types of what the sources publish or serve."""
     found = set()
+    names = {'ros': ros, 'device': DeviceSettings(), 'self': SimpleNamespace(_prefix='')}
     for folder in ('node_common', 'tissue_sim', 'haptic_bridge', 'cutting', 'bags', 'session'):
         for path in (ROOT / folder).rglob('*.py'):
             for call in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
                 maker = isinstance(call, ast.Call) and getattr(call.func, 'attr', '')
                 if maker in ('create_publisher', 'create_service') and path.name not in BESIDE:
                     kind, name = (ast.unparse(argument) for argument in call.args[:2])
-                    topic = eval(name, {'ros': ros, 'device': DeviceSettings(), **vars(ros)})
+                    topic = eval(name, names | vars(ros))
                     found.add((topic.lstrip('/'), kind))
     found |= {(ros.MARKERS, 'MarkerArray'), (ros.HAND, 'PoseStamped')}  # of the viewer
     found |= {(ros.E_STOP, 'Empty'), (ros.DIAGNOSTICS.lstrip('/'), 'DiagnosticArray')}

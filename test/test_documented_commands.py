@@ -140,6 +140,8 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer run python -m bench.files.damaged_bags BAG 300': Nowhere(
         'takes minutes: test_damaged_bags.py does it to fewer copies'
     ),
+    'python -m bench.page.frame_rate BAG': Nowhere('it measures the speed of a browser'),
+    'python -m bench.page.latency URL': Nowhere('it measures the speed of a browser and a graph'),
     'python -m bench.cuts.severance': Nowhere(
         'takes minutes: test_cutting_severance.py does it to fewer cuts'
     ),

@@ -23,6 +23,7 @@ pytestmark = [
     ),
 ]
 
+UP = np.array([0.0, 0.0, 1.0])
 SIZES = ((390, 844), (820, 1180), (1280, 800), (2560, 1440), (844, 390))
 EVIL = '<img src=x onerror="window.evil=1"><script>window.evil=2</script>'
 WATCH = """window.broken = [];
@@ -54,6 +55,47 @@ def opened(browser: Browser, stand_in: StandIn) -> Iterator[Page]:
         yield page
         assert page.evaluate('window.broken') == []
         page.open('about:blank')
+
+
+REACHED = """(() => {
+    const at = (x, y) => document.elementFromPoint(x, y);
+    const middle = r => [r.x + r.width / 2, r.y + r.height / 2];
+    const box = e => e.getBoundingClientRect();
+    const buttons = [...document.querySelectorAll('#guide button, #views button')];
+    const hidden = buttons.filter(one => at(...middle(box(one))) !== one);
+    const view = box(document.querySelector('#view')), shares = [0.35, 0.5, 0.65];
+    const covered = shares.flatMap(x => shares.map(y =>
+        at(view.x + x * view.width, view.y + y * view.height)?.tagName));
+    const panel = [...document.querySelectorAll('#panel button, #panel select, #panel input')];
+    const lost = panel.filter(one => one.offsetParent !== null).filter(one => {
+        one.scrollIntoView({block: 'center'});
+        return at(...middle(box(one))) !== one;
+    });
+    return {hidden: hidden.map(one => one.innerText), covered, lost: lost.map(one => one.id),
+        small: buttons.filter(one => box(one).height < 38).length};
+})()"""
+NAMELESS = """[...document.querySelectorAll('button, select, input, output, [role]')].filter(one =>
+    !(one.innerText || one.ariaLabel || one.title || one.labels?.length || one.closest('[hidden]')
+      || ['status', 'alert', 'log'].includes(one.role) || one.tagName === 'OUTPUT')
+).map(one => one.outerHTML)"""
+
+
+def test_every_control_is_reached_and_none_covers_the_tissue_at_every_size(
+    browser: Browser,
+) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        for width, height in SIZES:
+            page.resize(width, height)
+            there = page.evaluate(REACHED)
+            assert not there['hidden'] and not there['lost'], (width, height, there)
+            assert set(there['covered']) <= {'CANVAS', 'MAIN'}, (width, height, there)
+            assert not there['small'], (width, height, there)
+        page.resize(1000, 700)
+        assert page.evaluate(NAMELESS) == []
+        assert page.evaluate('document.title') == 'Cutting trainer'
+        assert page.evaluate('document.documentElement.lang') == 'en'
 
 
 def key(page: Page, code: str, name: str) -> None:
@@ -98,24 +140,147 @@ def test_e_stop_arrives_by_mouse_and_by_key_and_is_in_sight_at_every_size(browse
         assert not [message for message in stand_in.asked if message.op == 'pause']
 
 
-def test_one_drag_at_the_blade_takes_it_down_and_along(browser: Browser) -> None:
+def on_top(stand_in: StandIn, x: float, y: float) -> np.ndarray:
+    """A place on the upper side of the block [m]."""
+    return np.array([x, y, stand_in.positions[:, 2].max()])
+
+
+def end_of_blade(goal: Guide) -> np.ndarray:
+    """Where the blade ends at a goal [m]: it is upright."""
+    return np.array(goal.position) - [0.0, 0.0, 0.004]
+
+
+def test_blade_follows_the_pointer_and_goes_in_while_the_button_is_held(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:
-        tip = guided(page)
-        before = stand_in.tip.copy()
+        guided(page)
         view = page.state()['camera']
-        down = page.pixels(before + np.array([[0.0, 0.0, -0.02]]))[0]
-        page.drag(np.array([tip, *np.linspace(tip, down, 5), down + np.array([60.0, 0.0])]))
-        goals = stand_in.of(Guide)
-        assert goals
-        lowest = min(goal.position[2] for goal in goals)
-        assert lowest == pytest.approx(before[2] - 0.02, abs=0.003)
-        assert goals[-1].position[0] > before[0] + 0.005
+        begin, end = (on_top(stand_in, x, -0.008) for x in (-0.008, 0.008))
+        places = page.pixels(np.linspace(begin, end, 5))
+        for place in places[::-1]:
+            page.mouse('mouseMoved', *place)
+            time.sleep(0.05)
+        stand_in.wait(lambda: np.allclose(stand_in.tip, begin + 0.008 * UP, atol=1e-3))
+        over = end_of_blade(stand_in.of(Guide)[-1])
+        assert over == pytest.approx(begin + 0.004 * UP, abs=5e-4)
+        assert page.says('Height')
+        page.mouse('mousePressed', *places[0], pressed=True)
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < begin[2] - 0.006)
+        for place in places[1:]:
+            page.mouse('mouseMoved', *place, pressed=True)
+            time.sleep(0.05)
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[0] > end[0] - 1e-3)
+        assert page.state()['cutting'] and page.says('Cut depth')
+        page.mouse('mouseReleased', *places[-1])
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] > begin[2] + 0.003)
         assert page.state()['camera'] == view  # it was no turn of the view
-        stand_in.wait(lambda: np.allclose(stand_in.tip, goals[-1].position, atol=1e-3))
-        page.drag(np.array([[380.0, 600.0], [390.0, 600.0], [450.0, 610.0]]))
-        assert page.state()['camera'] != view  # beside the blade it is one
-        assert stand_in.of(Guide) == goals
+        time.sleep(0.5)  # until it is at its height again
+        goals = len(stand_in.of(Guide))
+        page.drag(np.array([[290.0, 520.0], [300.0, 520.0], [360.0, 530.0]]))
+        assert page.state()['camera'] != view  # beside the tissue it is one
+        assert len(stand_in.of(Guide)) == goals
+
+
+def test_no_goal_jumps_and_the_edge_turns_to_the_stroke(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        begin, end = on_top(stand_in, 0.0, -0.010), on_top(stand_in, 0.0, 0.010)
+        places = page.pixels(np.linspace(begin, end, 6))
+        page.mouse('mouseMoved', *places[0])
+        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], begin[:2], atol=1e-3))
+        before = len(stand_in.of(Guide))
+        page.mouse('mousePressed', *places[0], pressed=True)
+        page.mouse('mouseMoved', *places[-1], pressed=True)
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[1] > end[1] - 1e-3)
+        time.sleep(0.3)
+        goals = stand_in.of(Guide)[before:]
+        page.mouse('mouseReleased', *places[-1])
+        ways = np.diff([goal.position for goal in goals], axis=0)
+        assert np.linalg.norm(ways, axis=1).max() < 0.016  # 0.12 m/s and 0.04 m/s in 0.1 s at most
+        turns = 2 * np.arctan2(*np.array([[g.wxyz[3], g.wxyz[0]] for g in goals]).T)
+        assert np.abs(np.diff(turns)).max() < 0.41
+        assert turns[-1] == pytest.approx(np.pi / 2, abs=0.15)  # the stroke is along y
+
+
+def test_wheel_keys_and_the_button_that_stays_set_depth_and_cut(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        top = on_top(stand_in, 0.0, 0.0)
+        x, y = page.pixels(top[None])[0]
+        page.mouse('mouseMoved', x, y)
+        stand_in.wait(lambda: stand_in.of(Guide))
+        page.evaluate("document.querySelector('#view').focus()")
+        page.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0, deltaY=120)
+        page.wait(lambda: page.says('Height 3.5 mm'), 'the wheel')
+        key(page, 'PageDown', 'PageDown')
+        page.wait(lambda: page.says('Height 3.0 mm'), 'the key')
+        page.call('Input.dispatchKeyEvent', type='keyDown', code='KeyC', key='c')
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < top[2] - 0.005)
+        page.call('Input.dispatchKeyEvent', type='keyUp', code='KeyC', key='c')
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] > top[2] + 0.002)
+        page._click('[data-guide=cut]', 'true')
+        page.wait(lambda: page.state()['cutting'], 'the cut')
+        before = end_of_blade(stand_in.of(Guide)[-1])
+        page.evaluate("document.querySelector('#view').focus()")
+        for _ in range(6):
+            key(page, 'ArrowRight', 'ArrowRight')
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[0] > before[0] + 0.002)
+        key(page, 'Escape', 'Escape')
+        page.wait(lambda: not page.state()['canGuide'], 'the stop')
+        assert stand_in.of(EStop) and not page.state()['cutting']
+
+
+GAMEPAD = """(() => {
+    window.pad = {connected: true, axes: [0, 0, 0, 0],
+        buttons: [...Array(16)].map(() => ({pressed: false}))};
+    navigator.getGamepads = () => [window.pad];
+    window.dispatchEvent(new Event('gamepadconnected'));
+})()"""
+
+
+def test_a_gamepad_moves_cuts_and_stops(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        page.evaluate(GAMEPAD)
+        page.evaluate('window.pad.axes[0] = 0.9')
+        stand_in.wait(lambda: stand_in.of(Guide))
+        stand_in.wait(lambda: stand_in.of(Guide)[-1].position[0] > 0.01)
+        page.evaluate('window.pad.axes[0] = 0; window.pad.buttons[0].pressed = true')
+        page.wait(lambda: page.state()['cutting'], 'the cut')
+        page.evaluate('window.pad.buttons[1].pressed = true')
+        stand_in.wait(lambda: stand_in.of(EStop))
+        page.wait(lambda: not page.state()['cutting'], 'the stop')
+
+
+def touch(page: Page, kind: str, *points: np.ndarray) -> None:
+    page.call(
+        'Input.dispatchTouchEvent',
+        type=kind,
+        touchPoints=[{'x': p[0], 'y': p[1], 'id': i} for i, p in enumerate(points)],
+    )
+
+
+def test_a_finger_moves_the_blade_above_it_and_a_second_one_cuts(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        top = on_top(stand_in, 0.0, 0.0)
+        finger = page.pixels(top[None])[0]
+        lower = finger + np.array([0.0, 56.0])
+        touch(page, 'touchStart', finger)
+        stand_in.wait(lambda: stand_in.of(Guide))
+        assert not page.state()['cutting']
+        touch(page, 'touchMove', lower)
+        stand_in.wait(
+            lambda: np.allclose(end_of_blade(stand_in.of(Guide)[-1])[:2], top[:2], atol=2e-3)
+        )
+        touch(page, 'touchStart', lower, finger + np.array([90.0, 80.0]))
+        page.wait(lambda: page.state()['cutting'], 'the cut')
+        touch(page, 'touchEnd')
+        page.wait(lambda: not page.state()['cutting'], 'its end')
 
 
 def test_goals_come_at_thirty_a_second_at_most_and_none_once_the_force_is_off(
@@ -124,29 +289,28 @@ def test_goals_come_at_thirty_a_second_at_most_and_none_once_the_force_is_off(
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:
         guided(page)
-        events = """new Promise(done => {
+        x, y = page.pixels(on_top(stand_in, 0.0, 0.0)[None])[0]
+        events = f"""new Promise(done => {{
             const view = document.querySelector('#view'), began = performance.now();
-            const [x, y] = window.page.state.tip;
-            const say = (kind, dy) => view.dispatchEvent(new PointerEvent(kind, {
-                pointerId: 1, button: 0, clientX: x, clientY: y + dy, bubbles: true}));
-            view.setPointerCapture = () => {};
-            say('pointerdown', 0);
-            const timer = setInterval(() => {
-                for (let i = 0; i < 5; i += 1) say('pointermove', 5 * Math.random());
+            const timer = setInterval(() => {{
+                for (let i = 0; i < 5; i += 1) view.dispatchEvent(new PointerEvent('pointermove', {{
+                    pointerId: 1, clientX: {x} + 5 * Math.random(), clientY: {y}, bubbles: true}}));
                 if (performance.now() - began < 1000) return;
                 clearInterval(timer);
                 done(performance.now() - began);
-            }, 4);
-        })"""
+            }}, 4);
+        }})"""
         took = page.call(
             'Runtime.evaluate', expression=events, awaitPromise=True, returnByValue=True
         )
         most = 30 * took['result']['value'] / 1000 + 2
         assert 3 <= len(stand_in.of(Guide)) <= most
-        assert page.state()['dragging']
         key(page, 'Escape', 'Escape')
         page.wait(lambda: not page.state()['canGuide'], 'the stop')
-        assert not page.state()['dragging']
+        goals = len(stand_in.of(Guide))
+        page.mouse('mouseMoved', x, y)
+        time.sleep(0.3)
+        assert len(stand_in.of(Guide)) == goals
 
 
 def test_what_others_wrote_is_shown_as_text_and_nothing_of_it_runs(browser: Browser) -> None:

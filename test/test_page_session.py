@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from live import Recording, two_presses, write_scene
-from page_user import RIGHT, ROOT, UP, View, sessions, start, way
+from page_user import ROOT, View, cut, sessions
 
 from bench.page.browser import CHROMIUM, Page, chromium
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE
@@ -34,8 +34,10 @@ pytestmark = [
     ),
 ]
 
-DOWN, ALONG = 0.026, 0.012
-"""[m] that the blade is dragged: into a block 20 mm below it, and along it twice."""
+BEGIN, MIDDLE, END = (np.array([x, 0.0, 0.010]) for x in (-0.012, 0.0, 0.014))
+"""[m] places on a block that is 10 mm high."""
+NOTCHES = 5
+"""Of the wheel, by which it is cut deeper than 6 mm."""
 COMMAND_TIMEOUT_S = 240
 
 
@@ -56,25 +58,17 @@ class Made:
     status: int
 
 
-def drag(page: Page, axis: np.ndarray, length: float) -> None:
-    """Drags the blade by the mouse, and waits until the hand has come."""
-    start(page)
-    page.wait(lambda: page.state()['canGuide'], 'the hand')
-    tip = np.array(page.state()['moment']['tip'])
-    page.drag(page.pixels(way(tip, axis, length)))
-    time.sleep(0.5)
-
-
 def use(page: Page, known: set[Path]) -> tuple[Path, Any, Any]:
     """Cuts, records the next cut alone; the bag, and the page's state before and after it."""
     page.wait(lambda: page.state().get('tip') and page.state()['meshes'], 'the page')
-    drag(page, UP, -DOWN)
-    drag(page, RIGHT, ALONG)
+    cut(page, BEGIN, MIDDLE, NOTCHES)
     before = page.state()
-    page.press('record')
+    page.evaluate("document.querySelector('#record').click()")  # the mouse holds the cut
     page.wait(lambda: page.state()['recording'] and not page.state()['busy'], 'the recording')
-    drag(page, RIGHT, ALONG)
+    page.mouse('mouseReleased', *page.pixels(MIDDLE[None])[0])
+    cut(page, MIDDLE, END, NOTCHES)
     after = page.state()
+    page.mouse('mouseReleased', *page.pixels(END[None])[0])
     page.press('record')
     page.wait(lambda: not page.state()['recording'] and not page.state()['busy'], 'its end')
     (bag,) = sessions() - known
@@ -127,7 +121,7 @@ def test_the_recorded_drag_cuts_further(made: Made) -> None:
     assert edges[1] > edges[0]
     recording = Recording(made.bag)
     _, tips = recording.read('/tool/contact', ContactCodec(), 'device')
-    assert tips[-1, 0] - tips[0, 0] > 0.6 * ALONG
+    assert tips[-1, 0] - tips[0, 0] > 0.6 * (END - MIDDLE)[0]
 
 
 def test_report_of_it_is_written(made: Made, tmp_path: Path) -> None:

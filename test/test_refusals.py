@@ -221,8 +221,8 @@ def test_an_orientation_or_a_state_that_does_not_exist_is_not_believed() -> None
         with pytest.raises(MessageError, match='no such state'):
             codec().believed(codec().encode(5, values))
         values = [0] * len(values)
-        values[codec.fields['tool'].start] = 1
-        with pytest.raises(MessageError, match=r'tool 1 of .*: the scene has 1, and the first is'):
+        values[codec.fields['tool'].start] = 4
+        with pytest.raises(MessageError, match=r'tool 4 of .*: a scene has 4 at most, from 0'):
             codec().believed(codec().encode(5, values))
 
 

@@ -83,7 +83,7 @@ def test_recording_starts_before_all_others_and_ends_after_them(
     nodes = commands(ledger, recorder='slow', tissue_sim='slow', emulated_arm='done')
     with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:
         assert supervisor.start()
-        supervisor.run(60.0, until_done='emulated_arm')
+        supervisor.run(60.0, until_done=['emulated_arm'])
         outcome = supervisor.end()
     assert outcome.ran and outcome.finished and not outcome.interrupted
     assert not outcome.deaths and not outcome.killed
@@ -111,7 +111,7 @@ def test_all_lines_of_a_node_are_in_its_log_and_warnings_are_told(
 def test_time_limit_ends_a_session_that_never_says_done(tmp_path: Path, ledger: Ledger) -> None:
     with Supervisor(commands(ledger), tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:
         assert supervisor.start()
-        supervisor.run(0.3, until_done='emulated_arm')
+        supervisor.run(0.3, until_done=['emulated_arm'])
         outcome = supervisor.end()
     assert outcome.ran and not outcome.finished
     assert outcome.seconds >= 0.3

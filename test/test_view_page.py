@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from live import MEASURED_CP, SERVO_CF, Recording, two_presses, write_scene
-from page_user import RIGHT, UP, View, cut_coloured, reddish, sessions, start, way
+from page_user import View, cut, cut_coloured, point, reddish, sessions, start
 
 from bench.page.browser import CHROMIUM, Browser, Page, chromium
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, TOUCHING
@@ -29,8 +29,10 @@ pytestmark = [
     ),
 ]
 
-PRESS, DOWN, ALONG = 0.0180, 0.025, 0.026
-"""[m] that the blade is dragged: to press on a block that is 10 mm high, 9 mm into it, along it."""
+BEGIN, END = np.array([-0.013, 0.0, 0.010]), np.array([0.013, 0.0, 0.010])
+"""[m] places on a block that is 10 mm high."""
+NOTCHES = 14
+"""Turns of the wheel by 0.5 mm, from 4 mm above it."""
 BOX = """(r => [r.x, r.y, r.width, r.height])(
     document.querySelector('#view').getBoundingClientRect())"""
 STOP = """(r => [r.x, r.y, r.width, r.height].join(' '))(
@@ -79,18 +81,16 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
         if folder := os.environ.get('PICTURES'):
             page.save(Path(folder) / f'{name}.png')
 
-    def drag(axis: np.ndarray, length: float) -> None:
-        start(page)
-        page.wait(lambda: page.state()['canGuide'], 'the hand')
-        tip = np.array(page.state()['moment']['tip'])
-        page.drag(page.pixels(way(tip, axis, length)))
-        seen.forces.append(float(np.linalg.norm(page.state()['moment']['force'])))
-
     page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue')
     keep('before')
     page.press('record')
     wait_for_bag(page, seen)
-    drag(UP, -PRESS)
+    point(page, BEGIN)
+    x, y = page.pixels(BEGIN[None])[0]
+    for _ in range(NOTCHES):
+        page.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0, deltaY=120)
+    time.sleep(0.7)
+    seen.forces.append(float(np.linalg.norm(page.state()['moment']['force'])))
     keep('pressed', picture=False)
     start(page)
     time.sleep(1.5)
@@ -100,8 +100,9 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
     page.press('reset-e-stop')
     page.wait(lambda: not page.state()['eStopped'], 'the reset')
     keep('reset', picture=False)
-    drag(UP, PRESS - DOWN)
-    drag(RIGHT, ALONG)
+    cut(page, BEGIN, END)
+    page.mouse('mouseReleased', *page.pixels(END[None])[0])
+    time.sleep(0.7)
     keep('cut')
     page.reload()
     page.wait(lambda: page.state().get('meshes'), 'the page again')
@@ -199,13 +200,12 @@ def test_e_stop_is_shown_until_its_reset_and_stays_where_it_is(seen: Seen) -> No
     assert len(set(seen.stops.values())) == 1
 
 
-def test_hand_went_where_the_blade_was_dragged(recording: Recording) -> None:
+def test_hand_went_where_the_pointer_was(recording: Recording) -> None:
     poses: Any = [recording.bag.read(m).pose.position for m in recording.messages(MEASURED_CP)]
     ways = np.array([(p.x, p.y, p.z) for p in poses])
-    moved = ways[-1] - ways[0]
-    assert moved[2] < -0.6 * DOWN
-    assert moved[0] > 0.6 * ALONG
-    assert abs(moved[1]) < 0.01
+    moved = np.ptp(ways, axis=0)
+    assert moved[2] > 0.015
+    assert moved[0] > 0.6 * (END - BEGIN)[0]
 
 
 def commands(recording: Recording) -> list[tuple[str, float]]:

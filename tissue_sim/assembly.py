@@ -134,6 +134,7 @@ def make_simulation(
     settings: TissueSettings,
     before: MeshReplica | None = None,
     note: Callable[[str], None] = lambda text: None,
+    tools: int = 1,
 ) -> tuple[TissueSimulation, Plan | None]:
     """Return the simulation of a scene, and its plan if the scene asks for one.
 
@@ -143,6 +144,7 @@ def make_simulation(
         settings: its section `tissue`.
         before: state of the tissue in an earlier simulation of this scene, to continue from.
         note: gets one sentence if a plan is made anew, and the name of each measurement.
+        tools: number of tools in the tissue.
 
     Raises:
         MeshError: the mesh is not valid, has no shape at rest under its weight, or continues a
@@ -172,6 +174,7 @@ def make_simulation(
         contact=settings.contact,
         friction=settings.material.dry_friction,
         gravity=settings.gravity,
+        tools=tools,
     )
     if before is None:
         simulation.dynamics.settle()

@@ -3,15 +3,7 @@
 import time
 from pathlib import Path
 
-from cutting_trainer_msgs.msg import (
-    Contact,
-    ForceSample,
-    FrameInputs,
-    FreePiece,
-    Mesh,
-    MeshDelta,
-    State,
-)
+from cutting_trainer_msgs.msg import FreePiece, Mesh, MeshDelta, State
 from cutting_trainer_msgs.srv import GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
 
@@ -24,9 +16,7 @@ from cutting_trainer.node_common.parameters import (
     scene_parameter,
     seed_parameter,
 )
-from cutting_trainer.node_common.publishers import PublisherMonitor
-from cutting_trainer.node_common.rejections import MessageError
-from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.timing import (
     FRAME_NICENESS,
     FairLock,
@@ -34,8 +24,7 @@ from cutting_trainer.node_common.timing import (
     request_preference,
 )
 from cutting_trainer.tissue_sim.assembly import as_planned, make_simulation
-from cutting_trainer.tissue_sim.contact.incoming import tool_contact
-from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact
+from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.planner.monitor import PlanMonitor
@@ -47,8 +36,8 @@ from cutting_trainer.tissue_sim.streaming.cut_client import CutClient
 from cutting_trainer.tissue_sim.streaming.link_budget import LinkBudget
 from cutting_trainer.tissue_sim.streaming.mesh_recovery import recover_meshes
 from cutting_trainer.tissue_sim.streaming.state_publisher import StatePublisher
+from cutting_trainer.tissue_sim.streaming.tool_topics import ToolTopics
 
-_MAX_CONTACT_AGE_NS = 100_000_000
 _KEYFRAME_PERIOD_S = 5.0
 _MIN_STALL_S = 1.0
 """Time between two frames after which another node may have replaced this one."""
@@ -73,8 +62,8 @@ class TissueSimNode(ManagedNode):
         text = 'continue with the tissue known to its followers, in the place of a node that died'
         self._resumes = bool(parameter(self, 'resume', False, text))
         settings = read_section(scene, 'tissue', TissueSettings)
-        # First, so that a recorder discovers it while the tissue is set up.
-        self._inputs = self.create_publisher(FrameInputs, ros.FRAME_INPUTS, qos.STREAM)
+        labels = ('', *tool_names(scene))
+        self._tools = [ToolTopics(self, number, label) for number, label in enumerate(labels)]
         self._announced = time.monotonic()
         self._scene = scene.stem
         text = 'checkpoint file of the tissue, for a replacement of this node'
@@ -82,7 +71,9 @@ class TissueSimNode(ManagedNode):
         self._file = Path(file) if file else None
         before = self._tissue_before() if self._resumes else None
         self._checkpoint = Checkpoint(self._file) if self._file else None
-        self._simulation, plan = make_simulation(settings, before, self.get_logger().info)
+        self._simulation, plan = make_simulation(
+            settings, before, self.get_logger().info, len(labels)
+        )
         self._plan = None if plan is None else PlanMonitor(plan, self._simulation)
         self._log_plan()
         self._announce_method(as_planned(settings, plan))
@@ -96,8 +87,6 @@ class TissueSimNode(ManagedNode):
         self._pieces = PieceRegister(self._simulation.mesh)
         self._looked_at = self._simulation.mesh.topology
         self._lock = FairLock()
-        self._contact: Contact | None = None
-        self._contact_received = 0
         self._next_keyframe = self._next_checkpoint = 0.0
         self._frame: Frame | None = None
         self._ticked = self._suspects = 0.0
@@ -137,10 +126,9 @@ class TissueSimNode(ManagedNode):
     def _connect(self) -> None:
         self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, qos.LATCHED)
         self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
-        self._forces = self.create_publisher(ForceSample, ros.FORCE, qos.STREAM)
         self._free_pieces = self.create_publisher(FreePiece, ros.PIECES, qos.HISTORY)
-        self._contacts = ros.polled(self, Contact, ros.CONTACT, qos.NEWEST_BEST_EFFORT)
-        self._touching = PublisherMonitor(self, [ros.CONTACT])
+        for tool in self._tools:
+            tool.connect()
         self._cuts = CutClient(self, self._simulation, self.rejections)
         states = self.create_publisher(State, ros.TISSUE_STATE, qos.STREAM)
         self._states = StatePublisher(states)
@@ -178,7 +166,7 @@ class TissueSimNode(ManagedNode):
         re-simulated.
         """
         until = self._announced + _DISCOVERY_S
-        while self._inputs.get_subscription_count() == 0 and time.monotonic() < until:
+        while time.monotonic() < until and not all(tool.is_recorded for tool in self._tools):
             if stop.is_set():
                 return
             time.sleep(0.005)
@@ -193,14 +181,15 @@ class TissueSimNode(ManagedNode):
         resolved = self._cuts.take()
         touched = resolved.touched
         is_recorded = self._publish_state()
-        contact = self._newest_contact()
-        frame = self._simulation.frame(contact)
+        mesh = self._simulation.mesh
+        frame = self._simulation.frame(*(tool.contact(mesh) for tool in self._tools))
+        felt = list(zip(self._tools, frame.by_tool, strict=True))
         over = self._plan.follow(frame) if self._plan else ''
         if over:
             self.get_logger().warning(over, throttle_duration_sec=5.0)
         now = time.time_ns()
-        used = None if contact is None else self._contact
-        self._inputs.publish(messages.inputs_message(frame, used, resolved, now))
+        for tool, one in felt:
+            tool.publish_inputs(one, resolved, now)
         delta = None
         if touched is not None or frame.command is not None or self._link.allows(now * 1e-9):
             delta = self._encoder.encode(
@@ -209,15 +198,8 @@ class TissueSimNode(ManagedNode):
         if touched is not None and time.monotonic() >= self._next_checkpoint:
             self._keep(self._mesh_message())
         self._frame = frame
-        self._forces.publish(
-            messages.force_message(
-                frame,
-                self._encoder.revision,
-                self._simulation.mesh.topology,
-                used,
-                now,
-            )
-        )
+        for tool, one in felt:
+            tool.publish_force(one, self._encoder.revision, mesh.topology, now)
         self._tell_pieces(frame)
         self._diverged += frame.diverged
         if frame.trouble:
@@ -256,22 +238,6 @@ class TissueSimNode(ManagedNode):
             return False
         self._states.publish(state_of(simulation), simulation.step + 1)
         return True
-
-    def _newest_contact(self) -> ToolContact | None:
-        now = time.monotonic_ns()
-        try:
-            message = ros.take(self._contacts, self.max_message)
-            if stranger := self._touching.look(now * 1e-9):
-                raise MessageError('more than one publisher', stranger)
-            if message is not None:
-                self._contact, self._contact_received = message, now
-            if self._contact is None or now - self._contact_received > _MAX_CONTACT_AGE_NS:
-                return None
-            return tool_contact(self._contact, self._simulation.mesh)
-        except ValueError as error:
-            self.rejections.add(ros.CONTACT, error)
-            self._contact = None  # a message is rejected only once
-            return None
 
     def _publish_keyframe(self) -> None:
         message = self._mesh_message()
@@ -344,7 +310,8 @@ class TissueSimNode(ManagedNode):
         values |= self._cuts.values()
         values |= self._plan.values() if self._plan else {}
         values['diverged_frames'] = self._diverged
-        values['stranger'] = self._touching.cause
+        stranger = next(filter(None, (tool.cause for tool in self._tools)), '')
+        values['stranger'] = stranger
         if frame is None:
             return DiagnosticStatus.OK, 'starting', values
         values |= {'substeps': frame.substeps, 'slow_motion': frame.slow_motion}
@@ -363,8 +330,8 @@ class TissueSimNode(ManagedNode):
             return DiagnosticStatus.ERROR, f'a frame was taken back: {frame.trouble}', values
         if frame.trouble:
             return DiagnosticStatus.WARN, frame.trouble, values
-        if self._touching.cause:
-            return DiagnosticStatus.WARN, self._touching.cause, values
+        if stranger:
+            return DiagnosticStatus.WARN, stranger, values
         if strain is not None and strain.beyond:
             return DiagnosticStatus.WARN, strain.beyond, values
         if self._plan and self._plan.over:

@@ -37,7 +37,12 @@ def tool_shape(tool: ToolSettings) -> dict[str, Any]:
         name: {'vertices': np.round(vertices, 6).tolist(), 'faces': faces.tolist()}
         for name, (vertices, faces) in shapes.items()
     }
-    return {**meshes, 'radius': tool.radius}
+    return {
+        **meshes,
+        'radius': tool.radius,
+        'blade_tip': list(tool.blade_tip),
+        'blade_facing': tool.facing().tolist(),
+    }
 
 
 def camera(positions: Floats) -> dict[str, Any]:

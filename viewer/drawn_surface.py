@@ -10,8 +10,8 @@ from cutting_trainer.viewer.page_state import TissueFrame
 OUTER, CUT = 0, 1
 """Kinds of triangles, as in `Mesh`."""
 _LIFT_M = 0.0004
-"""[m] Height of the line along the edges of a cut. In a tissue without tension a cut closes again,
-and only this line shows it."""
+"""[m] Height of the band along the edges of a cut. In a tissue without tension a cut closes again,
+and only this band shows it."""
 
 
 class SurfacePart(NamedTuple):

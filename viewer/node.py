@@ -24,7 +24,7 @@ from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_re
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.node_common.output import announce
 from cutting_trainer.node_common.parameters import parameter, scene_parameter
-from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.share_folder import scene_names
 from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
@@ -107,7 +107,7 @@ class ViewerNode(ManagedNode):
         self._asked = Requests()
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._operation = Operation(
-            self, lambda text: self._calls.put(lambda: self._page.warn(text))
+            self, lambda text: self._calls.put(lambda: self._page.warn(text)), tool_names(scene)
         )
         self._open_page()
         self._loop = PeriodicLoop(RATE_HZ)
@@ -297,7 +297,7 @@ class ViewerNode(ManagedNode):
             return 'The haptic bridge is silent.'
         if self._operation.e_stopped:
             return 'E-STOP: no force until it is reset, and then Start.'
-        guided = 'Drag the blade to move it.' if can_guide else ''
+        guided = 'The blade follows the pointer; hold the button to cut.' if can_guide else ''
         said = {
             CrtkState.ENABLED: f'Force is on. {guided}',
             CrtkState.PAUSED: 'No force. Start goes on.',

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -29,13 +29,16 @@ class Operation:
     Args:
         node: for publishers, subscriptions and clients.
         warn: called with a sentence for the operator; may be called by any thread.
+        tools: namespaces of the further tools: commands are for all, the state is the first's.
 
     Attributes:
         state: of the haptic bridge; None before it is known.
         e_stopped: whether an E-STOP holds.
     """
 
-    def __init__(self, node: ManagedNode, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self, node: ManagedNode, warn: Callable[[str], None], tools: Sequence[str] = ()
+    ) -> None:
         self.state: CrtkState | None = None
         self.e_stopped = False
         self._arm_state: CrtkState | None = None
@@ -44,13 +47,20 @@ class Operation:
         self._starting = False
         types = crtk_types()
         self._command = types.command
-        bridge_command, arm_command = (f'{name}/state_command' for name in (BRIDGE, ros.ARM))
-        self._to_bridge = node.create_publisher(types.command, bridge_command, qos.EVENTS)
-        self._to_arm = node.create_publisher(types.command, arm_command, qos.EVENTS)
+        prefixes = ('', *(f'{tool}/' for tool in tools))
+        self._to_bridge, self._to_arm = (
+            [
+                node.create_publisher(types.command, f'{prefix}{name}/state_command', qos.EVENTS)
+                for prefix in prefixes
+            ]
+            for name in (BRIDGE, ros.ARM)
+        )
         self._stop = node.create_publisher(Empty, f'{BRIDGE}/e_stop', qos.EVENTS)
         self._goal = node.create_publisher(PoseStamped, ros.HAND, qos.EVENTS)
         self._setter = node.create_client(SetParameters, f'{BRIDGE}/set_parameters')
-        self._resetter = node.create_client(Trigger, f'{BRIDGE}/reset_e_stop')
+        self._resetters = [
+            node.create_client(Trigger, f'{prefix}{BRIDGE}/reset_e_stop') for prefix in prefixes
+        ]
         for name, take in ((BRIDGE, self._bridge_says), (ros.ARM, self._arm_says)):
             topic = f'{name}/operating_state'
             ros.listen(node, types.operating_state, topic, take, qos.LATCHED)
@@ -88,11 +98,12 @@ class Operation:
 
     def reset_stop(self) -> None:
         """Clear the E-STOP; force stays off until `start`."""
-        if not self._resetter.service_is_ready():
+        if not all(resetter.service_is_ready() for resetter in self._resetters):
             self._warn('The haptic bridge does not answer: the E-STOP holds.')
             return
-        future = self._resetter.call_async(Trigger.Request())
-        future.add_done_callback(lambda done: self._was_reset(done.result()))
+        for resetter in self._resetters:
+            future = resetter.call_async(Trigger.Request())
+            future.add_done_callback(lambda done: self._was_reset(done.result()))
 
     def _was_reset(self, response: Any) -> None:
         if response is None or not response.success:
@@ -138,10 +149,11 @@ class Operation:
     def _starts_no_more(self) -> None:
         self._starting, self._enable_at = False, math.inf
 
-    def _send(self, publisher: Any, word: str) -> None:
+    def _send(self, publishers: Sequence[Any], word: str) -> None:
         message = self._command(string=word)
         message.header.stamp = ros.stamp(time.time_ns())
-        publisher.publish(message)
+        for publisher in publishers:
+            publisher.publish(message)
 
     def _bridge_says(self, message: Any) -> None:
         self.state = known_state(message.state)

@@ -184,10 +184,12 @@ class Browser:
         port: of the DevTools.
         size: of its pages [pixel].
         coarseness: pixels of the page for one that is drawn, along each side.
+        process: number of its first process.
     """
 
-    def __init__(self, port: int, size: tuple[int, int], coarseness: int) -> None:
+    def __init__(self, port: int, size: tuple[int, int], coarseness: int, process: int) -> None:
         self._port, self._size, self._coarseness = port, size, coarseness
+        self.process = process
         self.pages: list[Page] = []
 
     def page(self, url: str = 'about:blank') -> Page:
@@ -233,7 +235,8 @@ def chromium(size: tuple[int, int], coarseness: int = 1) -> Iterator[Browser]:
                 assert process.poll() is None, Path(profile, 'said').read_text()
                 assert time.monotonic() < deadline, 'chromium does not start'
                 time.sleep(0.05)
-            browser = Browser(int(file.read_text().splitlines()[0]), size, coarseness)
+            port = int(file.read_text().splitlines()[0])
+            browser = Browser(port, size, coarseness, process.pid)
             yield browser
             for page in browser.pages:
                 page.close()

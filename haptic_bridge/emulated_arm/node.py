@@ -24,11 +24,16 @@ from cutting_trainer.node_common.cdr_codec import (
     WrenchStampedCodec,
 )
 from cutting_trainer.node_common.crtk import StateInterface
-from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
+from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, name_of, run
 from cutting_trainer.node_common.operating_state import CrtkState, OperatingStateMachine, crtk_types
 from cutting_trainer.node_common.orientation import from_quaternion, quaternion
 from cutting_trainer.node_common.output import announce
-from cutting_trainer.node_common.parameters import parameter, scene_parameter, seed_parameter
+from cutting_trainer.node_common.parameters import (
+    parameter,
+    scene_parameter,
+    seed_parameter,
+    tool_parameter,
+)
 from cutting_trainer.node_common.publishers import PublisherMonitor
 from cutting_trainer.node_common.qos import EVENTS, LATCHED, NEWEST_BEST_EFFORT, STREAM
 from cutting_trainer.node_common.realtime import prepare, run_real_time
@@ -62,6 +67,7 @@ class ArmNode(ManagedNode):
 
     Parameters:
         scene: path of the scene file.
+        tool: name of its tool in the section `tools`; empty: the first.
         seconds: [s] duration of the script; 0: as in the scene.
         seed: of the tremor.
         auto_enable: start in the state ENABLED.
@@ -86,8 +92,9 @@ class ArmNode(ManagedNode):
         text = "duration to which the script is stretched [s]; 0: the script's own"
         seconds = float(parameter(self, 'seconds', 0.0, text, within=(0.0, _MAX_SCRIPT_S)))
         seed = seed_parameter(self)
-        settings = read_section(scene, 'arm', ArmSettings)
-        device = read_section(scene, 'device', DeviceSettings)
+        tool = tool_parameter(self)
+        settings = read_section(scene, 'arm', ArmSettings, tool)
+        device = read_section(scene, 'device', DeviceSettings, tool)
         script = compile_script(settings.require_script(), device.tissue_from_device, seconds)
         body_force = device.force_frame == 'body'
         self._convention = DeviceConvention(device)
@@ -188,7 +195,7 @@ class ArmNode(ManagedNode):
         self._press(self._script.button_at(arm.script_time))
         if arm.script_over and not self._done:
             self._done = True
-            announce(f'done: {self.get_name()}')
+            announce(f'done: {name_of(self)}')
 
     def _take_command(self, now: int) -> None:
         taken = take_numbered(self._servo_cf)

@@ -24,7 +24,7 @@ _MAX_FORCE = 1e6
 """[N] Largest stiffness times the largest coordinate."""
 
 
-def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
+def tool_contact(message: Any, mesh: TetMesh, tool: int = 0) -> ToolContact:
     """Return a checked contact for the simulation.
 
     Args:
@@ -32,13 +32,14 @@ def tool_contact(message: Any, mesh: TetMesh) -> ToolContact:
             without the header.
         mesh: the tissue. The nodes of a message about another topology are dropped: a cut may have
             renumbered or removed them.
+        tool: number of the tool that the contact has to be of.
 
     Raises:
         MessageError: one sentence with the wrong field.
     """
     if hasattr(message, 'header'):
         _check_header(message.header)
-    require_tool('Contact', message.tool)
+    require_tool('Contact', message.tool, tool)
     if message.state > ContactState.INSIDE:
         raise MessageError('no such state', f'state {message.state} is none of 0, 1, 2')
     if message.mode not in list(ToolMode):

@@ -135,7 +135,7 @@ def force_message(
     frame: Frame, revision: int, topology: int, contact: Contact | None, time_ns: int
 ) -> ForceSample:
     """Return the reaction of one frame as a message."""
-    message = ForceSample(step=frame.step, revision=revision, topology=topology)
+    message = ForceSample(step=frame.step, revision=revision, topology=topology, tool=frame.tool)
     message.header.frame_id = FRAME
     message.header.stamp = stamp(time_ns)
     if contact is not None:
@@ -165,7 +165,7 @@ def inputs_message(
         resolved: the cut applied at its beginning.
         time_ns: stamp [ns].
     """
-    message = FrameInputs(step=frame.step, diverged=frame.diverged)
+    message = FrameInputs(step=frame.step, diverged=frame.diverged, tool=frame.tool)
     message.answer, message.cut_step = int(resolved.outcome), resolved.cut_step
     message.answer_frames, message.waited = ANSWER_FRAMES, resolved.waited
     message.header.frame_id = FRAME

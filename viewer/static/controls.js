@@ -87,10 +87,13 @@ export class Controls {
     });
   }
 
-  showMoment(moment) {
+  /** @param {object} moment @param {number|null} height of the blade's end over the surface [m] */
+  showMoment(moment, height) {
     $('hud').hidden = false;
     $('hud-force').textContent = Math.hypot(...moment.force).toFixed(2);
-    $('hud-depth').textContent = (1000 * moment.depth).toFixed(1);
+    const above = moment.depth === 0 && height > 0;
+    $('hud-depth-name').textContent = above ? 'Height' : 'Depth';
+    $('hud-depth').textContent = (1000 * (above ? height : moment.depth)).toFixed(1);
     $('hud-contact').textContent = CONTACTS[moment.contact] ?? '';
   }
 

@@ -1,15 +1,23 @@
-// Guides the blade by mouse, touch and keys: they move the goal, and the hand follows it.
+// Guides the blade: it follows a pointer, keys or a gamepad over the tissue, and cuts while one is held.
 
 import { Plane, Quaternion, Raycaster, Vector2, Vector3 } from './vendor/three.module.min.js';
 
 const PERIOD_MS = 1000 / 30;
-const REACH = { mouse: 26, pen: 30, touch: 44 }; // [pixel] from the tool that still grip it
+const HEIGHT = 0.004, HEIGHTS = [-0.015, 0.03]; // [m] of the blade's end over the surface, without a cut
+const DEPTH = 0.006, DEPTHS = [0, 0.03]; // [m] under it, in a cut
+const NOTCH = 0.0005; // [m] of the wheel
 const STEP = 0.0005, LONG_STEP = 0.002; // [m] of a key, with Shift
-const NOTCH = 0.0005; // [m] of a notch of the wheel
 const ROTATION_STEP = Math.PI / 60; // of a key
-const MAX_SLOPE = 0.82; // slope of the view above which an upright plane is no use
+const DOWN = 0.04, UP = 0.15, STROKE = 0.12; // [m/s] of the goal: down, up, along a cut
+const MAX_PUSH = 0.016; // [m] beyond the depth, until the blade goes in: hand and tissue yield
+const NEAR = 0.005; // [m] beside the place of a cut from where the blade goes down
+const FAR = 0.012, MAX_LIFT = 0.02; // [m] of a way from which the blade is lifted over the tissue
+const TURN = 4; // [rad/s] of the edge to the direction of a cut
+const HEADING = 0.003; // [m] of a cut that make its direction
+const MIN_SHARE = 0.1; // of the speed, while the edge does not face the stroke
 const SHOWN_DISTANCE = 0.0015; // [m] between tool and goal above which the goal is shown
-const MAX_DRAG = 0.2; // [m] longest drag
+const FINGER = 56; // [pixel] that the blade is above a finger, which would hide it
+const INSIDE = 2; // contact of a moment
 const Z = new Vector3(0, 0, 1);
 const KEYS = {
   ArrowLeft: ['right', -1], ArrowRight: ['right', 1], ArrowUp: ['ahead', 1], ArrowDown: ['ahead', -1],
@@ -18,221 +26,323 @@ const KEYS = {
 const ROTATION_KEYS = {
   q: ['z', 1], e: ['z', -1], r: ['right', 1], f: ['right', -1], z: ['ahead', 1], x: ['ahead', -1],
 };
+const clamp = (value, [low, high]) => Math.min(high, Math.max(low, value));
 
 export class Guide {
   /**
    * @param {HTMLElement} place around the canvas
    * @param {object} stage the drawn scene
    * @param {function} send takes position and wxyz
+   * @param {function} changed called after a change of what `said` returns
    */
-  constructor(place, stage, send) {
+  constructor(place, stage, send, changed) {
     this._place = place;
     this._stage = stage;
     this._send = send;
+    this._changed = changed;
     this.allowed = false;
     this.bounds = null;
-    this.goal = null;
-    this.level = false;
-    this._drag = null;
-    this._plane = new Plane();
+    this.follows = true;
+    this.byView = true; // whether right and ahead are those of the view, or of the tissue's axes
+    this.height = HEIGHT;
+    this.depth = DEPTH;
+    this._cuts = new Set(); // what holds the cut
+    this._finger = null;
     this._ray = new Raycaster();
-    this._next = 0;
-    this._timer = null;
+    this.forget();
     const on = (kind, take) => place.addEventListener(kind, take, { capture: true, passive: false });
     on('pointerdown', (event) => this._press(event));
     on('pointermove', (event) => this._move(event));
-    on('pointerup', (event) => this._release(event));
-    on('pointercancel', (event) => this._release(event));
-    on('lostpointercapture', (event) => this._release(event));
+    for (const kind of ['pointerup', 'pointercancel', 'lostpointercapture']) on(kind, (event) => this._release(event));
     on('wheel', (event) => this._wheel(event));
-    place.addEventListener('keydown', (event) => this._key(event));
+    window.addEventListener('keydown', (event) => this._key(event));
+    window.addEventListener('keyup', (event) => {
+      if (event.key.toLowerCase() === 'c') this.hold('key', false);
+    });
+    window.addEventListener('blur', () => {
+      for (const by of ['key', 'pad', 'pointer']) this.hold(by, false);
+    });
   }
 
-  get dragging() {
-    return this._drag !== null;
+  get cutting() {
+    return this._cuts.size > 0;
   }
 
-  /** Sets whether the hand follows goals, by the server; it ends a drag without effect. */
+  /** Sets whether the hand follows goals, by the server; where not, nothing is held. */
   allow(allowed) {
     if (this.allowed === allowed) return;
     this.allowed = allowed;
     if (!allowed) this.forget();
   }
 
-  /** Sets the goal to the place of the tool. */
+  /** Forgets goal and cut: the next motion begins where the tool is. */
   forget() {
-    this._drag = null;
+    this._cuts.clear();
+    this._finger = null;
     this.goal = null;
+    this._aim = null; // place on the surface, and its normal
+    this._path = []; // places of a cut that are still to be passed
+    this._push = this._level = 0;
+    this._entered = false;
+    this._heading = null;
     clearTimeout(this._timer);
     this._timer = null;
     this.show();
+    this._changed();
+  }
+
+  /** Begins or ends a cut by one of those that can hold it: key, pointer, pad, latch. */
+  hold(by, on) {
+    if (on === this._cuts.has(by)) return;
+    if (on && !this._begin()) return;
+    const before = this.cutting;
+    if (on) this._cuts.add(by);
+    else this._cuts.delete(by);
+    if (this.cutting === before) return;
+    if (!this.cutting) {
+      if (this._path.length > 0) this._aim = this._path.at(-1);
+      this._path = [];
+      this._push = 0;
+    }
+    this._entered = false;
+    this._heading = this.cutting ? this._aim.point.clone() : null;
+    this._changed();
+    this._soon();
   }
 
   /** Shows the goal where it differs from the place of the tool. */
   show() {
     const { moment, tool } = this._stage;
     const far = this.goal !== null && moment !== null
-      && (this.dragging || this.goal.position.distanceTo(new Vector3().fromArray(moment.tip)) > SHOWN_DISTANCE);
+      && this.goal.position.distanceTo(new Vector3().fromArray(moment.tip)) > SHOWN_DISTANCE;
     tool.showGoal(far ? this.goal : null);
     this._stage.invalidate();
   }
 
-  /** Moves the goal along directions of the view: right, ahead (both level), up [m]. */
+  /** Moves the goal along a direction of the view, right or ahead, over the surface; or up [m]. */
   shift(direction, by) {
-    this._begin();
-    if (this.goal === null) return;
-    this._clamp(this.goal.position.addScaledVector(this._direction(direction), by));
-    this._tell();
+    if (!this._begin()) return;
+    if (direction === 'up') {
+      this.raise(by);
+      return;
+    }
+    const point = (this._path.at(-1) ?? this._aim).point.clone().addScaledVector(this._direction(direction), by);
+    this._aimAt(this._stage.surface.upright(point) ?? { point, normal: Z.clone() });
+  }
+
+  /** Changes the height, or in a cut the depth [m]. */
+  raise(by) {
+    if (!this._begin()) return;
+    if (this.cutting) this.depth = clamp(this.depth - by, DEPTHS);
+    else this.height = clamp(this.height + by, HEIGHTS);
+    this._changed();
+    this._soon();
   }
 
   /** Rotates the goal about such a direction, or z [rad]. */
   turn(direction, by) {
-    this._begin();
-    if (this.goal === null) return;
-    const turn = new Quaternion().setFromAxisAngle(this._direction(direction), by);
-    this.goal.quaternion.premultiply(turn).normalize();
-    this._tell();
+    if (!this._begin()) return;
+    this.goal.quaternion.premultiply(new Quaternion().setFromAxisAngle(this._direction(direction), by)).normalize();
+    this._soon();
   }
 
   _direction(name) {
-    if (name === 'up' || name === 'z') return Z;
-    const right = new Vector3().setFromMatrixColumn(this._stage.camera.matrixWorld, 0).setZ(0).normalize();
+    if (name === 'z') return Z;
+    const right = this.byView
+      ? new Vector3().setFromMatrixColumn(this._stage.camera.matrixWorld, 0).setZ(0).normalize()
+      : new Vector3(1, 0, 0);
     return name === 'right' ? right : new Vector3().crossVectors(Z, right);
   }
 
-  _begin() {
-    const { moment } = this._stage;
-    if (!this.allowed || moment === null) this.goal = null;
-    else if (this.goal === null) {
-      const [w, x, y, z] = moment.wxyz;
-      this.goal = { position: new Vector3().fromArray(moment.tip), quaternion: new Quaternion(x, y, z, w) };
-    }
+  /** Returns whether there is a goal; the first one is where the tool is, or at a height [m]. */
+  _begin(height = null) {
+    const { moment, surface } = this._stage;
+    if (!this.allowed || moment === null) return false;
+    if (this.goal !== null) return true;
+    const [w, x, y, z] = moment.wxyz;
+    this.goal = { position: new Vector3().fromArray(moment.tip), quaternion: new Quaternion(x, y, z, w) };
+    const end = this.goal.position.clone().add(this._toEnd());
+    this._aim = surface.upright(end) ?? { point: end.clone().setZ(0), normal: Z.clone() };
+    this._level = clamp(end.z - this._aim.point.z, HEIGHTS);
+    this.height = height ?? this._level;
+    return true;
   }
+
+  /** From the tool's position to the end of its blade. */
+  _toEnd() {
+    return this._stage.tool.bladeEnd.clone().applyQuaternion(this.goal.quaternion);
+  }
+
+  // Pointers
 
   _press(event) {
-    if (this.dragging) {
-      event.stopPropagation(); // a second finger rotates no view under the first
+    if (this._finger !== null && event.pointerId !== this._finger) {
+      event.stopPropagation(); // a second finger rotates no view under the first: it cuts
+      this.hold('pointer', true);
       return;
     }
-    if (event.button !== 0 || !this._onTool(event)) return;
-    this._begin();
-    if (this.goal === null) return;
+    if (event.button !== 0 || !this.allowed || !this.follows) return;
+    const hit = this._hit(event, 0);
+    if (hit === null || !this._begin(HEIGHT)) return;
     event.stopPropagation();
-    event.preventDefault();
     this._place.setPointerCapture(event.pointerId);
-    this._drag = { pointer: event.pointerId, level: null };
-    this._grip(event);
-    this.show();
-  }
-
-  // The present pointer position belongs to the present goal: from here on both move together.
-  _grip(event) {
-    const level = this._isLevel(event);
-    const from = this.goal.position.clone();
-    const ahead = this._direction('ahead');
-    this._plane.setFromNormalAndCoplanarPoint(level ? Z : ahead, from);
-    Object.assign(this._drag, { level, from, x: event.clientX, y: event.clientY, at: this._hit(event) });
-  }
-
-  _isLevel(event) {
-    const down = -this._stage.camera.getWorldDirection(new Vector3()).z;
-    return this.level !== event.shiftKey || down > MAX_SLOPE;
-  }
-
-  _hit(event) {
-    const box = this._stage.canvas.getBoundingClientRect();
-    const place = new Vector2(
-      (2 * (event.clientX - box.x)) / box.width - 1, 1 - (2 * (event.clientY - box.y)) / box.height,
-    );
-    this._ray.setFromCamera(place, this._stage.camera);
-    return this._ray.ray.intersectPlane(this._plane, new Vector3());
+    this._finger = event.pointerId;
+    const isFinger = event.pointerType === 'touch';
+    this._aimAt(isFinger ? this._hit(event) ?? hit : hit);
+    if (!isFinger) this.hold('pointer', true);
   }
 
   _move(event) {
-    if (!this.dragging) {
-      this._place.classList.toggle('grip', this.allowed && this._onTool(event));
-      return;
-    }
-    event.stopPropagation();
-    if (event.pointerId !== this._drag.pointer) return;
-    if (this._isLevel(event) !== this._drag.level) this._grip(event);
-    const at = this._hit(event);
-    if (at === null || this._drag.at === null) return;
-    const moved = at.sub(this._drag.at).clampLength(0, MAX_DRAG);
-    this._clamp(this.goal.position.copy(this._drag.from).add(moved));
-    this._tell();
+    const steers = event.pointerId === this._finger;
+    if (this._finger !== null) event.stopPropagation();
+    if (!this.allowed || !this.follows || !(steers || (this._finger === null && event.buttons === 0 && event.pointerType !== 'touch'))) return;
+    const hit = this._hit(event) ?? (this.cutting && steers ? this._beside(event) : null);
+    this._place.classList.toggle('aims', hit !== null);
+    if (hit !== null && this._begin(HEIGHT)) this._aimAt(hit);
   }
 
   _release(event) {
-    if (!this.dragging || event.pointerId !== this._drag.pointer) return;
+    if (this._finger === null) return;
     event.stopPropagation();
-    this._drag = null;
-    this.show();
+    this.hold('pointer', false);
+    if (event.pointerId === this._finger) this._finger = null;
   }
 
   _wheel(event) {
-    if (!this.allowed || !(this.dragging || event.shiftKey)) return;
+    if (!this.allowed || !this.follows || event.ctrlKey || (this._finger === null && this._hit(event, 0) === null)) return;
     event.stopPropagation();
     event.preventDefault();
-    const way = Math.sign(event.deltaY || event.deltaX);
-    this.shift('up', -way * NOTCH);
-    if (this.dragging) this._drag.from.z -= way * NOTCH;
+    this.raise(-Math.sign(event.deltaY || event.deltaX) * NOTCH);
   }
 
+  /** The place of the tissue under a pointer, or null. */
+  _hit(event, above = event.pointerType === 'touch' ? FINGER : 0) {
+    const box = this._stage.canvas.getBoundingClientRect();
+    const x = (2 * (event.clientX - box.x)) / box.width - 1, y = 1 - (2 * (event.clientY - above - box.y)) / box.height;
+    this._ray.setFromCamera(new Vector2(x, y), this._stage.camera);
+    return this._stage.surface.hit(this._ray.ray);
+  }
+
+  /** Beside the tissue a cut goes on at the same height, so that it can leave through an edge. */
+  _beside(event) {
+    this._hit(event); // aims the ray
+    const last = (this._path.at(-1) ?? this._aim).point;
+    const plane = new Plane().setFromNormalAndCoplanarPoint(Z, last);
+    const point = this._ray.ray.intersectPlane(plane, new Vector3());
+    if (point === null || point.distanceTo(last) > 5 * FAR) return null;
+    return { point, normal: Z.clone() };
+  }
+
+  // Keys
+
   _key(event) {
-    if (event.target !== this._place || event.ctrlKey || event.metaKey || event.altKey) return;
-    const shift = KEYS[event.key], turn = ROTATION_KEYS[event.key.toLowerCase()];
-    if (!this.allowed || (!shift && !turn)) return;
+    const tag = event.target.tagName;
+    if (event.ctrlKey || event.metaKey || event.altKey || tag === 'SELECT' || tag === 'INPUT' || !this.allowed) return;
+    const key = event.key.toLowerCase();
+    if (key === 'c') {
+      if (!event.repeat) this.hold('key', true);
+      return;
+    }
+    if (event.target !== this._place) return;
+    const shift = KEYS[event.key], turn = ROTATION_KEYS[key];
+    if (!shift && !turn) return;
     event.preventDefault();
     if (shift) this.shift(shift[0], shift[1] * (event.shiftKey ? LONG_STEP : STEP));
     else this.turn(turn[0], turn[1] * ROTATION_STEP);
   }
 
-  /** Whether a pointer is at the drawn tool, or at its goal. */
-  _onTool(event) {
-    const { tool, moment } = this._stage;
-    if (moment === null) return false;
-    const reach = REACH[event.pointerType] ?? REACH.mouse;
-    const shown = tool.ghost.visible ? [tool.group, tool.ghost] : [tool.group];
-    return shown.some((group) => {
-      group.updateMatrixWorld();
-      const tip = this._stage.project(group.position);
-      const end = this._stage.project(tool.end.clone().applyMatrix4(group.matrixWorld));
-      return tip.before && distance(event.clientX, event.clientY, tip, end) < reach;
-    });
+  // From the aim to the goal
+
+  _aimAt(hit) {
+    if (this.cutting) this._path.push(hit);
+    else this._aim = hit;
+    this._soon();
   }
 
-  _clamp(position) {
+  // At most thirty times a second; the first one at once.
+  _soon() {
+    const wait = (this._next ?? 0) - performance.now();
+    if (wait <= 0) this._advance();
+    else this._timer ??= setTimeout(() => this._advance(), wait);
+  }
+
+  _advance() {
+    clearTimeout(this._timer);
+    this._timer = null;
+    const now = performance.now(), { moment } = this._stage;
+    const dt = Math.min(0.1, Math.max(0.001, (now - (this._last ?? now - PERIOD_MS)) / 1000));
+    this._last = now;
+    if (this.goal === null || moment === null) return;
+    this._next = now + PERIOD_MS;
+    const end = new Vector3().fromArray(moment.tip).add(this._toEnd());
+    const way = Math.hypot(end.x - this._aim.point.x, end.y - this._aim.point.y);
+    const sinks = this._down(dt, way, moment.contact === INSIDE);
+    const moves = this._along(dt) || sinks || way > FAR;
+    const lift = this.cutting ? 0 : clamp(way - FAR, [0, MAX_LIFT]);
+    this.goal.position.copy(this._aim.point).addScaledVector(this._aim.normal, this._level)
+      .addScaledVector(Z, lift).sub(this._toEnd());
+    this._bound(this.goal.position);
+    this._say();
+    this.show();
+    if (moves) this._timer ??= setTimeout(() => this._advance(), PERIOD_MS);
+  }
+
+  /** Moves the level to that of the cut, or of the height; returns whether it goes on. */
+  _down(dt, way, inside) {
+    if (this.cutting && way > NEAR && this._level > 0 && this._push === 0) return true; // not there yet
+    const wanted = this.cutting ? -this.depth - this._push : this.height;
+    const step = clamp(wanted - this._level, [-DOWN * dt, UP * dt]);
+    this._level += step;
+    if (!this.cutting) return Math.abs(wanted - this._level) > 1e-6;
+    this._entered ||= inside;
+    if (this._entered) this._push = 0;
+    else if (this._level - wanted < 1e-9) this._push = clamp(this._push + DOWN * dt, [0, MAX_PUSH]);
+    return true;
+  }
+
+  /** Follows the path of a cut, the edge ahead; returns whether it goes on. */
+  _along(dt) {
+    // The blade waits where it goes in.
+    let left = this._entered || this._push === MAX_PUSH ? STROKE * dt * this._head(dt) : 0;
+    while (this._path.length > 0 && left > 0) {
+      const next = this._path[0], far = next.point.distanceTo(this._aim.point);
+      const share = Math.min(1, left / Math.max(far, 1e-12));
+      this._aim = {
+        point: this._aim.point.clone().lerp(next.point, share),
+        normal: this._aim.normal.clone().lerp(next.normal, share).normalize(),
+      };
+      if (share === 1) this._path.shift();
+      left -= far;
+    }
+    return this._path.length > 0;
+  }
+
+  /** Turns the edge to the stroke, as a hand does; returns the share of the speed until it faces it. */
+  _head(dt) {
+    const { facing } = this._stage.tool;
+    const ahead = this._path.find(({ point }) => point.distanceTo(this._aim.point) > HEADING) ?? this._aim;
+    const way = ahead.point.clone().sub(this._heading).setZ(0);
+    const length = way.length();
+    if (facing.lengthSq() === 0 || length < HEADING) return 1;
+    this._heading.addScaledVector(this._aim.point.clone().sub(this._heading), 1 - HEADING / length);
+    const edge = facing.clone().applyQuaternion(this.goal.quaternion);
+    const angle = Math.atan2(edge.x * way.y - edge.y * way.x, edge.x * way.x + edge.y * way.y);
+    const turn = new Quaternion().setFromAxisAngle(Z, clamp(angle, [-TURN * dt, TURN * dt]));
+    this.goal.quaternion.premultiply(turn).normalize();
+    return Math.max(MIN_SHARE, Math.cos(angle));
+  }
+
+  _bound(position) {
     if (this.bounds === null) return;
     const { low, high } = this.bounds;
     position.clamp(new Vector3().fromArray(low), new Vector3().fromArray(high));
   }
 
-  // At most thirty times a second; the last one always.
-  _tell() {
-    this.show();
-    const now = performance.now();
-    if (now < this._next) {
-      this._timer ??= setTimeout(() => this._say(), this._next - now);
-      return;
-    }
-    this._say();
-  }
-
   _say() {
-    clearTimeout(this._timer);
-    this._timer = null;
-    if (this.goal === null) return;
-    this._next = performance.now() + PERIOD_MS;
     const { x, y, z, w } = this.goal.quaternion;
-    this._send(this.goal.position.toArray(), [w, x, y, z]);
+    const told = [...this.goal.position.toArray(), w, x, y, z];
+    if (this._told?.every((value, i) => Math.abs(value - told[i]) < 1e-7)) return;
+    this._told = told;
+    this._send(told.slice(0, 3), told.slice(3));
   }
-}
-
-/** Of a place from the line between two others [pixel]. */
-function distance(x, y, a, b) {
-  const dx = b.x - a.x, dy = b.y - a.y;
-  const length = dx * dx + dy * dy || 1;
-  const share = Math.min(1, Math.max(0, ((x - a.x) * dx + (y - a.y) * dy) / length));
-  return Math.hypot(x - a.x - share * dx, y - a.y - share * dy);
 }

@@ -2,6 +2,7 @@
 
 import { Connection } from './connection.js';
 import { Controls } from './controls.js';
+import { Gamepad } from './gamepad.js';
 import { decodeMesh } from './mesh.js';
 import { Notices } from './notices.js';
 import { Plots } from './plots.js';
@@ -25,6 +26,7 @@ const send = (message) => {
 const controls = new Controls(send);
 const stop = new Stop($('e-stop'), $('reset-e-stop'), connection, (text) => notices.say(text, 'bad'));
 const timeline = new TimeLine(send);
+new Gamepad(() => guide, () => stop.active && stop.press());
 let plots = new Plots($('plots'), null);
 
 const takers = {
@@ -50,8 +52,8 @@ const takers = {
   scale: (message) => controls.showScale(message),
   moment: (message) => {
     seen.moments += 1;
-    controls.showMoment(message);
     onStage(() => stage.takeMoment(message));
+    controls.showMoment(message, stage?.marks.height ?? null);
     canGuide = message.can_guide;
     allowGuide();
     guide?.show();
@@ -149,7 +151,7 @@ async function openStage() {
   try {
     const [{ Stage }, { Guide }] = await Promise.all([import('./stage.js'), import('./guide.js')]);
     stage = new Stage($('view'), query.get('quality'));
-    guide = new Guide($('view'), stage, (position, wxyz) => connection.send({ op: 'guide', position, wxyz }));
+    guide = new Guide($('view'), stage, (position, wxyz) => connection.send({ op: 'guide', position, wxyz }), showGuide);
     for (const job of waiting) job();
     connectViews();
     allowGuide();
@@ -170,22 +172,39 @@ function connectViews() {
     const name = views[Number(event.key) - 1];
     if (event.target === $('view') && name !== undefined) stage.view(name);
   });
-  const actions = {
-    up: () => guide.shift('up', 0.001),
-    down: () => guide.shift('up', -0.001),
+  const held = {
+    up: () => guide.raise(0.001),
+    down: () => guide.raise(-0.001),
     left: () => guide.turn('z', Math.PI / 36),
     right: () => guide.turn('z', -Math.PI / 36),
   };
-  for (const button of $('guide').children) {
-    const act = actions[button.dataset.guide];
+  const switched = {
+    follow: () => { guide.follows = !guide.follows; },
+    cut: () => guide.hold('latch', $('guide').querySelector('[data-guide=cut]').ariaPressed !== 'true'),
+    axes: () => { guide.byView = !guide.byView; },
+  };
+  for (const button of $('guide').querySelectorAll('button')) {
+    const act = held[button.dataset.guide];
     if (act) repeat(button, act);
     else {
       button.addEventListener('click', () => {
-        guide.level = !guide.level;
-        button.setAttribute('aria-pressed', String(guide.level));
+        switched[button.dataset.guide]();
+        showGuide();
       });
     }
   }
+  showGuide();
+}
+
+/** Shows what the guide is set to: the server does not know it. */
+function showGuide() {
+  if (guide === null) return;
+  const pressed = { follow: guide.follows, cut: guide.cutting, axes: guide.byView };
+  for (const [name, on] of Object.entries(pressed)) {
+    $('guide').querySelector(`[data-guide=${name}]`).setAttribute('aria-pressed', String(on));
+  }
+  const [word, length] = guide.cutting ? ['Cut depth', guide.depth] : ['Height', guide.height];
+  $('guide-set').textContent = `${word} ${(1000 * length).toFixed(1)} mm`;
 }
 
 /** Does something once by a click, and again as long as a button is held. */
@@ -216,7 +235,7 @@ function snapshot() {
     eStopped: controls.state.e_stopped,
     ...controls.session,
     canGuide: guide?.allowed ?? false,
-    dragging: guide?.dragging ?? false,
+    cutting: guide?.cutting ?? false,
     goal: guide?.goal?.position.toArray() ?? null,
     meshes: seen.meshes,
     moments: seen.moments,

@@ -2,7 +2,7 @@
 
 const COLOURS = ['#56b4e9', '#f0a33a', '#3fc99a', '#d68bb8']; // distinct for the colour-blind too
 const DASHES = [[], [6, 4], [2, 3], [8, 3, 2, 3]];
-const AXIS = '#93a1af', GRID = 'rgba(147, 161, 175, 0.2)', NOW = '#f2f5f7';
+const AXIS = '#93a1af', GRID = 'rgba(147, 161, 175, 0.2)';
 const LEFT = 38, RIGHT = 8, TOP = 8, BOTTOM = 18; // [pixel]
 const STEPS = [1, 2, 5];
 
@@ -61,7 +61,11 @@ class Plot {
     caption.append(this._title, this._legend, this._value);
     this._canvas = document.createElement('canvas');
     this._canvas.setAttribute('role', 'img');
-    this.figure.append(caption, this._canvas);
+    // The present time is a line of its own: drawing all lines again for each picture costs more than the tissue.
+    this._mark = document.createElement('i');
+    this._mark.className = 'now';
+    this._mark.hidden = true;
+    this.figure.append(caption, this._canvas, this._mark);
     this._line = null;
     this._names = '';
     this._now = mark;
@@ -100,7 +104,7 @@ class Plot {
 
   mark(time) {
     this._now = time;
-    this._ask();
+    if (this._line !== null) this._drawNow();
   }
 
   _ask() {
@@ -129,8 +133,7 @@ class Plot {
     const y = (value) => bottom - (Math.min(value, top) / top) * (bottom - TOP);
     this._axes(context, x, y, top, { right, bottom, height });
     this._lines(context, x, y);
-    if (this._now !== null) this._drawNow(context, x(this._now), bottom);
-    this._say();
+    this._drawNow();
   }
 
   _top() {
@@ -193,14 +196,16 @@ class Plot {
     context.restore();
   }
 
-  _drawNow(context, at, bottom) {
-    context.strokeStyle = NOW;
-    context.setLineDash([]);
-    context.lineWidth = 1.5;
-    context.beginPath();
-    context.moveTo(at, TOP - 4);
-    context.lineTo(at, bottom);
-    context.stroke();
+  _drawNow() {
+    this._mark.hidden = this._now === null;
+    if (this._now !== null) {
+      const [begin, end] = this._span;
+      const { offsetLeft, offsetTop, clientWidth, clientHeight } = this._canvas;
+      const share = Math.min(1, Math.max(0, (this._now - begin) / (end - begin || 1)));
+      this._mark.style.height = `${clientHeight - BOTTOM - TOP + 4}px`;
+      this._mark.style.transform = `translate(${offsetLeft + LEFT + share * (clientWidth - LEFT - RIGHT)}px, ${offsetTop + TOP - 4}px)`;
+    }
+    this._say();
   }
 
   // The present values, in words too.
@@ -211,7 +216,9 @@ class Plot {
     const shown = Object.entries(values).map(([name, line]) => [name, line[at]])
       .filter(([, value]) => Number.isFinite(value))
       .map(([name, value]) => [name, value.toFixed(value >= 20 ? 0 : value >= 2 ? 1 : 2)]);
-    this._value.textContent = shown.map(([, value]) => value).join(' / ');
+    const present = shown.map(([, value]) => value).join(' / ');
+    if (this._value.textContent === present) return;
+    this._value.textContent = present;
     const said = shown.map(([name, value]) => `${name} ${value} ${unit}`).join(', ');
     this._canvas.setAttribute('aria-label', `${title}: ${said}`);
   }

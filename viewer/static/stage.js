@@ -5,6 +5,8 @@ import {
 } from './vendor/three.module.min.js';
 import { OrbitControls } from './vendor/OrbitControls.js';
 import { Floor } from './floor.js';
+import { RelaxedSurface } from './relaxed_surface.js';
+import { TipMarks } from './tip_marks.js';
 import { TissueView } from './tissue.js';
 import { Arrow, Proxy, Tool } from './tool.js';
 
@@ -48,6 +50,9 @@ export class Stage {
     this.tool = new Tool(this.scene);
     this.proxy = new Proxy(this.scene);
     this.arrow = new Arrow(this.scene);
+    this.marks = new TipMarks(this.scene);
+    this.surface = new RelaxedSurface();
+    this._shown = null; // name of the tissue that the tool is in
     this.tissues = new Map();
     this.moment = null;
     this.frames = 0;
@@ -80,6 +85,7 @@ export class Stage {
     }
     // Kept tissues keep their faces: the server does not send them again.
     for (const tissue of hello.tissues) this._tissue(tissue.name).look(tissue);
+    this._shown = names[0];
     this._label(hello.tissues);
     this.tool.equip(hello.tool);
     this._radius = hello.tool.radius;
@@ -142,7 +148,18 @@ export class Stage {
     const fresh = tissue.first === null;
     tissue.update(mesh);
     if (fresh) this._shade();
+    if (mesh.name === this._shown) {
+      if (fresh) this.surface.forget();
+      this.surface.take(tissue.geometries, this.moment?.contact ?? 0);
+      this._mark();
+    }
     this.invalidate();
+  }
+
+  _mark() {
+    if (this.moment === null) return;
+    const { position, quaternion } = this.tool.group;
+    this.marks.place(this.tool.bladeEnd.clone().applyQuaternion(quaternion).add(position), this.surface);
   }
 
   takeMoment(moment) {
@@ -150,6 +167,7 @@ export class Stage {
     this.tool.place(moment);
     this.proxy.place(this._radius, moment.proxy);
     this.arrow.place(moment.tip, moment.force);
+    this._mark();
     this.invalidate();
   }
 

@@ -1,20 +1,24 @@
-// One tissue in the scene: its outside, the cut faces, and a line along the edges of the cuts.
+// One tissue in the scene: its outside, the cut faces, and a band of blood along the edges of the cuts.
 
 import {
-  Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Group, Mesh, MeshBasicMaterial,
-  MeshPhongMaterial, SRGBColorSpace,
+  Box3, BufferAttribute, BufferGeometry, CanvasTexture, DynamicDrawUsage, Group, LinearFilter, Mesh,
+  MeshBasicMaterial, MeshPhongMaterial, SRGBColorSpace,
 } from './vendor/three.module.min.js';
 
-const OPENED = 0x8a0614;
-const CUT_EDGE = 0x5c0410;
-const CUT_EDGE_RADIUS = 0.00045; // [m]
+const OPENED = 0xa30a18;
+const CORE = 0x2a0206; // between the lips of a cut
+const CORE_RADIUS = 0.0006; // [m]
+const BLOOD = 0xb00012;
+const BAND = 0.0026; // [m] half the width of the blood beside a cut
+const FAT = [1.75, 5.5, 3.6]; // of the opened colour at the skin: the rim of a cut face is pale
+const RIM = 0.0012, DEEP = 0.012; // [m] under the edge of a cut: thickness of the rim, the darkest
 
 export class TissueView {
   constructor(scene) {
     this.group = new Group();
     const looks = {
       outer: { vertexColors: true, specular: 0x4a3a38, shininess: 46 },
-      cut: { color: OPENED, specular: 0x401014, shininess: 70, flatShading: true, side: 2 },
+      cut: { color: OPENED, vertexColors: true, specular: 0xa07070, shininess: 90, flatShading: true, side: 2 },
     };
     this.parts = {};
     for (const [kind, look] of Object.entries(looks)) {
@@ -24,9 +28,13 @@ export class TissueView {
       this.group.add(mesh);
       this.parts[kind] = mesh;
     }
-    this.cutEdges = new Mesh(new BufferGeometry(), new MeshBasicMaterial({ color: CUT_EDGE }));
-    this.cutEdges.frustumCulled = false;
-    this.group.add(this.cutEdges);
+    this.cutEdges = new Mesh(new BufferGeometry(), new MeshBasicMaterial({ color: CORE }));
+    const wet = { color: BLOOD, specular: 0xffffff, shininess: 120, map: fadedBand(), transparent: true, depthWrite: false, side: 2 };
+    this.blood = new Mesh(new BufferGeometry(), new MeshPhongMaterial(wet));
+    for (const mesh of [this.blood, this.cutEdges]) {
+      mesh.frustumCulled = false;
+      this.group.add(mesh);
+    }
     this.first = null;
     this.revision = -1;
     scene.add(this.group);
@@ -59,6 +67,10 @@ export class TissueView {
     }
   }
 
+  get geometries() {
+    return [this.parts.outer.geometry, this.parts.cut.geometry];
+  }
+
   /** Vertices and faces by kind, and points of the cut edges: for tests. */
   get counts() {
     const count = (mesh) => [
@@ -88,6 +100,8 @@ export class TissueView {
       if (kind === 'outer') {
         mesh.geometry.setAttribute('normal', dynamic(new Float32Array(positions.length)));
         mesh.geometry.setAttribute('color', new BufferAttribute(mottle(positions), 3));
+      } else {
+        mesh.geometry.setAttribute('color', dynamic(new Float32Array(positions.length).fill(1)));
       }
       mesh.visible = faces.length > 0;
     } else {
@@ -102,8 +116,10 @@ export class TissueView {
   _showCutEdges(points) {
     const count = Math.floor(points.length / 6);
     this._cutEdgePoints = points.length / 3;
-    this.cutEdges.visible = count > 0;
+    this.cutEdges.visible = this.blood.visible = count > 0;
     if (count === 0) return;
+    this._showBlood(points, count);
+    shade(this.parts.cut.geometry, points);
     const { geometry } = this.cutEdges;
     if (geometry.index?.count !== 18 * count) {
       geometry.dispose();
@@ -116,6 +132,68 @@ export class TissueView {
     position.needsUpdate = true;
   }
 
+  /** A flat band over each edge, upright to the mean normal of the surface near it. */
+  _showBlood(points, count) {
+    if (this.blood.geometry.index?.count !== 6 * count) {
+      this.blood.geometry.dispose();
+      const geometry = new BufferGeometry();
+      geometry.setAttribute('position', dynamic(new Float32Array(12 * count)));
+      geometry.setAttribute('normal', dynamic(new Float32Array(12 * count)));
+      const uv = new Float32Array(8 * count), faces = new Uint32Array(6 * count);
+      for (let i = 0; i < count; i += 1) {
+        uv.set([0, 0, 0, 1, 1, 0, 1, 1], 8 * i);
+        faces.set([0, 2, 1, 1, 2, 3].map((corner) => 4 * i + corner), 6 * i);
+      }
+      geometry.setAttribute('uv', new BufferAttribute(uv, 2));
+      geometry.setIndex(new BufferAttribute(faces, 1));
+      this.blood.geometry = geometry;
+    }
+    const { position, normal } = this.blood.geometry.attributes;
+    bands(points, count, this.parts.outer.geometry, position.array, normal.array);
+    position.needsUpdate = normal.needsUpdate = true;
+  }
+
+}
+
+/** A texture across the band: opaque in the middle, gone at its sides. */
+function fadedBand() {
+  const element = document.createElement('canvas');
+  element.width = 4;
+  element.height = 64;
+  const context = element.getContext('2d');
+  const fade = context.createLinearGradient(0, 0, 0, 64);
+  for (const [at, opacity] of [[0, 0], [0.22, 0.22], [0.38, 0.85], [0.5, 1], [0.62, 0.85], [0.78, 0.22], [1, 0]]) {
+    fade.addColorStop(at, `rgba(255, 255, 255, ${opacity})`);
+  }
+  context.fillStyle = fade;
+  context.fillRect(0, 0, 4, 64);
+  const texture = new CanvasTexture(element);
+  texture.generateMipmaps = false;
+  texture.minFilter = LinearFilter;
+  return texture;
+}
+
+/** Shares of the opened colour by the depth under the edges of the cut: pale rim, then darker. */
+function shade(geometry, points) {
+  const at = geometry.attributes.position?.array;
+  if (!at || points.length === 0) return;
+  if (geometry.attributes.color?.array.length !== at.length) {
+    geometry.setAttribute('color', dynamic(new Float32Array(at.length)));
+  }
+  if (geometry.userData.shaded === geometry.index) return;
+  geometry.userData.shaded = geometry.index;
+  const colours = geometry.attributes.color.array;
+  for (let i = 0; i < at.length; i += 3) {
+    let least = Infinity;
+    for (let k = 0; k < points.length; k += 6) {
+      const x = at[i] - points[k], y = at[i + 1] - points[k + 1], z = at[i + 2] - points[k + 2];
+      least = Math.min(least, x * x + y * y + z * z);
+    }
+    const depth = Math.sqrt(least);
+    const dark = 1.15 - 0.8 * Math.min(1, depth / DEEP);
+    for (let axis = 0; axis < 3; axis += 1) colours[i + axis] = depth < RIM ? FAT[axis] : dark;
+  }
+  geometry.attributes.color.needsUpdate = true;
 }
 
 function dynamic(array) {
@@ -161,6 +239,45 @@ function mottle(positions) {
   return colours;
 }
 
+/** Corners of a band over each segment, in the plane of the surface at the node that is nearest. */
+function bands(points, count, { attributes }, out, normals) {
+  const at = attributes.position.array, up = attributes.normal.array;
+  const known = new Map(); // ends of segments are shared
+  const upAt = (k) => {
+    const key = `${points[k]},${points[k + 1]},${points[k + 2]}`;
+    if (known.has(key)) return known.get(key);
+    let best = 0, least = Infinity;
+    for (let i = 0; i < at.length; i += 3) {
+      const x = at[i] - points[k], y = at[i + 1] - points[k + 1], z = at[i + 2] - points[k + 2];
+      const far = x * x + y * y + z * z;
+      if (far < least) [least, best] = [far, i];
+    }
+    known.set(key, best);
+    return best;
+  };
+  for (let i = 0; i < count; i += 1) {
+    const s = 6 * i, a = upAt(s), b = upAt(s + 3);
+    let nx = up[a] + up[b], ny = up[a + 1] + up[b + 1], nz = up[a + 2] + up[b + 2];
+    const size = Math.hypot(nx, ny, nz) || 1;
+    nx /= size; ny /= size; nz /= size;
+    let x = points[s + 3] - points[s], y = points[s + 4] - points[s + 1], z = points[s + 5] - points[s + 2];
+    const length = Math.hypot(x, y, z) || 1;
+    x /= length; y /= length; z /= length;
+    let cx = ny * z - nz * y, cy = nz * x - nx * z, cz = nx * y - ny * x;
+    const across = BAND / (Math.hypot(cx, cy, cz) || 1);
+    cx *= across; cy *= across; cz *= across;
+    const longer = 0.35 * BAND;
+    for (let corner = 0; corner < 4; corner += 1) {
+      const end = corner < 2 ? s : s + 3, way = corner < 2 ? -longer : longer, side = corner % 2 ? 1 : -1;
+      const to = 12 * i + 3 * corner;
+      out[to] = points[end] + way * x + side * cx;
+      out[to + 1] = points[end + 1] + way * y + side * cy;
+      out[to + 2] = points[end + 2] + way * z + side * cz;
+      normals[to] = nx; normals[to + 1] = ny; normals[to + 2] = nz;
+    }
+  }
+}
+
 /** Faces of tubes with three sides, six corners each. */
 function prisms(count) {
   const faces = new Uint32Array(18 * count);
@@ -189,9 +306,9 @@ function tubes(points, count, out) {
     ax /= norm; ay /= norm; az /= norm;
     const bx = y * az - z * ay, by = z * ax - x * az, bz = x * ay - y * ax;
     for (let corner = 0; corner < 3; corner += 1) {
-      const u = CUT_EDGE_RADIUS * COS[corner], v = CUT_EDGE_RADIUS * SIN[corner];
+      const u = CORE_RADIUS * COS[corner], v = CORE_RADIUS * SIN[corner];
       const ox = u * ax + v * bx, oy = u * ay + v * by, oz = u * az + v * bz;
-      const longer = 0.5 * CUT_EDGE_RADIUS, at = 18 * i + 3 * corner;
+      const longer = 0.5 * CORE_RADIUS, at = 18 * i + 3 * corner;
       out[at] = points[s] + ox - longer * x;
       out[at + 1] = points[s + 1] + oy - longer * y;
       out[at + 2] = points[s + 2] + oz - longer * z;

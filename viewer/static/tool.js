@@ -31,6 +31,8 @@ export class Tool {
     this.ghost = new Group();
     this.ghost.visible = false;
     this.end = new Vector3(0, 0, 0.1);
+    this.bladeEnd = new Vector3();
+    this.facing = new Vector3();
     scene.add(this.group, this.ghost);
   }
 
@@ -45,6 +47,8 @@ export class Tool {
       this.group.add(solid(shape, new MeshPhongMaterial(look)));
       this.ghost.add(solid(shape, new MeshBasicMaterial(ghostly)));
     }
+    this.bladeEnd.fromArray(tool.blade_tip);
+    this.facing.fromArray(tool.blade_facing);
     this.end.set(0, 0, 0);
     for (const corner of tool.handle.vertices) {
       const [x, y, z] = corner;

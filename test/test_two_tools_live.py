@@ -1,0 +1,151 @@
+"""Two arms in one tissue over DDS: what is felt through it, who lives on when one of them dies."""
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from live import (
+    SERVO_CF,
+    LiveSession,
+    Recording,
+    free_domain,
+    phase,
+    wait_for,
+    write_scene,
+    zero_from,
+)
+from ruamel.yaml import YAML
+
+from cutting_trainer.bags.comparison import compare
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate_command import pose_check, recomputation
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.tissue_sim.contact.tool import ContactState
+
+pytestmark = pytest.mark.live
+
+SECONDS = 9.0
+OTHER = (0.012, 0.008)
+TOUCHED, LIFTED = 0.0110, 0.0220
+"""Heights of the tips [m]; the surface is at 10 mm and the radius 4 mm."""
+NAMES = ('emulated_arm', 'haptic_bridge')
+
+
+def two_arms(folder: Path) -> Path:
+    """The block, pressed by the first arm for long; the second one grasps it and lifts."""
+    spot = (-0.012, -0.008)
+    presses = [
+        phase('approach', (*spot, 0.0190, 1.0), share=1.0),
+        phase('palpate', (*spot, TOUCHED, 0.6), (*spot, TOUCHED, 6.0), share=6.5),
+        phase('retract', (*spot, 0.0300, 1.0), share=1.5),
+    ]
+    path = write_scene(folder, presses, SECONDS, cut_threshold=100.0)
+    scene = YAML(typ='safe').load(path)
+    closing: dict[str, Any] = {'kind': 'rest', 'share': 0.4, 'button': True, 'name': 'close'}
+    grasps = [
+        phase('approach', (*OTHER, 0.0190, 1.0), share=1.0),
+        phase('palpate', (*OTHER, TOUCHED, 1.0), share=1.5),
+        closing,
+        phase('palpate', (*OTHER, LIFTED, 1.0), (*OTHER, LIFTED, 2.0), share=4.1),
+        {**closing, 'name': 'open'},
+        phase('retract', (*OTHER, 0.0300, 1.0), share=1.6),
+    ]
+    start = {'position': [*OTHER, 0.030]}
+    scene['tools'] = {
+        'grasper': {
+            'tool': {'mode': 'open_grasper'},
+            'device': {'mode_button': 0},
+            'arm': {'script': {'start': start, 'seconds': SECONDS, 'phases': grasps}},
+        }
+    }
+    with path.open('w') as file:
+        YAML().dump(scene, file)
+    return path
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Iterator[LiveSession]:
+    session = LiveSession(tmp_path, two_arms(tmp_path), free_domain())
+    yield session
+    session.clean()
+
+
+def states(recording: Recording, tool: str) -> np.ndarray:
+    """The states of a tool in the tissue, frame by frame."""
+    return recording.read(f'{tool}/tissue/force', ForceSampleCodec(), 'state')[1].ravel()
+
+
+def test_one_presses_while_the_other_lifts_and_all_is_the_same_again(
+    session: LiveSession, tmp_path: Path
+) -> None:
+    assert not session.complaints()
+    recording = Recording(session.bag)
+    assert (states(recording, '') == ContactState.TOUCHING).sum() > 30
+    assert (states(recording, '/grasper') == ContactState.INSIDE).sum() > 30
+    _, force, state = recording.read('/grasper/tissue/force', ForceSampleCodec(), 'force', 'state')
+    assert force[state.ravel() == ContactState.INSIDE, 2].min() < -0.02  # it pulls the tissue up
+    for number, tool in enumerate(('', '/grasper')):
+        _, tools = recording.read(f'{tool}/tool/contact', ContactCodec(), 'tool')
+        assert set(tools.ravel()) == {number}
+    bag = open_bag(session.bag)
+    scene = load_scene(str(restore_scene(bag, tmp_path)))
+    result = compare(bag, recomputation(scene), pose_check(scene))
+    assert result.identical, result
+    assert not result.missing
+    assert result.forces == 2 * result.frames
+
+
+def kill(session: LiveSession, node: str) -> int:
+    """Kills a node of the grasper while it holds the tissue; returns when [ns]."""
+    for name in NAMES:
+        session.wait_until_said(f'grasper/{name} is ready')
+    session.wait_until_pressed(0.07)
+    found = [
+        int(entry.name)
+        for entry in Path('/proc').iterdir()
+        if entry.name.isdecimal() and is_of_grasper(entry, session.scene, node)
+    ]
+    (process,) = found
+    now = time.time_ns()
+    os.kill(process, signal.SIGKILL)
+    wait_for(
+        lambda: f'grasper/{node} died' in session.said, f'the launcher to say that {node} died'
+    )
+    return now
+
+
+def is_of_grasper(entry: Path, scene: Path, node: str) -> bool:
+    try:
+        words = (entry / 'cmdline').read_text().split('\0')
+    except OSError:
+        return False
+    module = f'cutting_trainer.haptic_bridge{".emulated_arm" * (node == "emulated_arm")}.node'
+    return module in words and '__ns:=/grasper' in words and any(str(scene) in w for w in words)
+
+
+@pytest.mark.parametrize('node', NAMES)
+def test_when_one_arm_or_bridge_dies_the_other_tool_goes_on(
+    session: LiveSession, node: str
+) -> None:
+    killed = kill(session, node)
+    assert session.end() == Status.NODE_DIED
+    recording = Recording(session.bag)
+    at = recording.at(killed)
+    times, norms = recording.force(SERVO_CF)
+    felt = norms[(times > at + 1.0) & (times < at + 2.0)]
+    assert len(felt) > 100
+    assert felt.min() > 0.0  # the other hand presses on, and is not let go
+    if node == 'emulated_arm':  # its bridge is in FAULT
+        others, zero = recording.force('/grasper' + SERVO_CF)
+        assert others[-1] > at + 1.0
+        assert zero_from(others, zero) < at + 1.0
+    frames, state = recording.read('/grasper/tissue/force', ForceSampleCodec(), 'state')
+    assert not state[frames > at + 1.0].any()  # the jaws have let go
