@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -89,6 +90,7 @@ def offered() -> dict[str, QoSProfile]:
                         'qos': qos,
                         'name': owner,
                         'device': device,
+                        'self': SimpleNamespace(_prefix=''),
                         **vars(ros),
                         **vars(qos),
                     }

@@ -17,6 +17,7 @@ PANELS = {
     'liver_suspended': ('large_strain',),
     'pad': ('large_strain',),
     'palpation': ('indentation',),
+    'two_tools': ('large_strain',),
 }
 """Problems of the chart that resemble a scene."""
 

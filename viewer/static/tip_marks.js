@@ -1,8 +1,8 @@
 // Below the tip: its shadow on the surface, and a line between both that shows height or depth.
 
+import { fadedTexture } from './faded_texture.js';
 import {
-  CanvasTexture, CylinderGeometry, Group, LinearFilter, Mesh, MeshBasicMaterial, PlaneGeometry,
-  RingGeometry, Vector3,
+  CylinderGeometry, Group, Mesh, MeshBasicMaterial, PlaneGeometry, RingGeometry, Vector3,
 } from './vendor/three.module.min.js';
 
 const ABOVE = 0xe8f1f8, BELOW = 0xffd166;
@@ -62,17 +62,7 @@ export class TipMarks {
 }
 
 function softDisc() {
-  const element = document.createElement('canvas');
-  element.width = element.height = 64;
-  const context = element.getContext('2d');
-  const fade = context.createRadialGradient(32, 32, 0, 32, 32, 32);
-  fade.addColorStop(0, 'rgba(10, 2, 4, 0.9)');
-  fade.addColorStop(0.5, 'rgba(10, 2, 4, 0.5)');
-  fade.addColorStop(1, 'rgba(10, 2, 4, 0)');
-  context.fillStyle = fade;
-  context.fillRect(0, 0, 64, 64);
-  const texture = new CanvasTexture(element);
-  texture.generateMipmaps = false;
-  texture.minFilter = LinearFilter;
-  return texture;
+  return fadedTexture(64, 64, (context) => context.createRadialGradient(32, 32, 0, 32, 32, 32), [
+    [0, 'rgba(10, 2, 4, 0.9)'], [0.5, 'rgba(10, 2, 4, 0.5)'], [1, 'rgba(10, 2, 4, 0)'],
+  ]);
 }

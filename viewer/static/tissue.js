@@ -1,8 +1,9 @@
 // One tissue in the scene: its outside, the cut faces, and a band of blood along the edges of the cuts.
 
+import { fadedTexture } from './faded_texture.js';
 import {
-  Box3, BufferAttribute, BufferGeometry, CanvasTexture, DynamicDrawUsage, Group, LinearFilter, Mesh,
-  MeshBasicMaterial, MeshPhongMaterial, SRGBColorSpace,
+  Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Group, Mesh, MeshBasicMaterial,
+  MeshPhongMaterial, SRGBColorSpace,
 } from './vendor/three.module.min.js';
 
 const OPENED = 0xa30a18;
@@ -157,20 +158,9 @@ export class TissueView {
 
 /** A texture across the band: opaque in the middle, gone at its sides. */
 function fadedBand() {
-  const element = document.createElement('canvas');
-  element.width = 4;
-  element.height = 64;
-  const context = element.getContext('2d');
-  const fade = context.createLinearGradient(0, 0, 0, 64);
-  for (const [at, opacity] of [[0, 0], [0.22, 0.22], [0.38, 0.85], [0.5, 1], [0.62, 0.85], [0.78, 0.22], [1, 0]]) {
-    fade.addColorStop(at, `rgba(255, 255, 255, ${opacity})`);
-  }
-  context.fillStyle = fade;
-  context.fillRect(0, 0, 4, 64);
-  const texture = new CanvasTexture(element);
-  texture.generateMipmaps = false;
-  texture.minFilter = LinearFilter;
-  return texture;
+  const opacities = [[0, 0], [0.22, 0.22], [0.38, 0.85], [0.5, 1], [0.62, 0.85], [0.78, 0.22], [1, 0]];
+  return fadedTexture(4, 64, (context) => context.createLinearGradient(0, 0, 0, 64),
+    opacities.map(([at, opacity]) => [at, `rgba(255, 255, 255, ${opacity})`]));
 }
 
 /** Shares of the opened colour by the depth under the edges of the cut: pale rim, then darker. */
