@@ -41,8 +41,9 @@ def smoothed(path: Floats) -> Floats:
 def log_dimensionless_jerk(path: Floats) -> float:
     """Return -ln(T^3 / v^2 * integral of squared jerk), v the peak speed; NaN without motion.
 
-    Of the magnitude of jerk, as Balasubramanian et al., On the analysis of movement smoothness,
-    J. NeuroEng. Rehabil. 12:112 (2015), table 3, propose for positions. It is -ln(204.8) = -5.32 for a motion of minimum jerk, and lower if less smooth.
+    Of the magnitude of jerk, as Balasubramanian et al., On the analysis of movement smoothness, J.
+    NeuroEng. Rehabil. 12:112 (2015), table 3, propose for positions. It is -ln(204.8) = -5.32 for a
+    motion of minimum jerk, and lower if less smooth.
 
     Args:
         path: at the rate of this module [m], shape (k, 3).

@@ -2,10 +2,11 @@
 
 Published: rms of physiological tremor at 8 to 12 Hz, 50 to 200 um, and rms error of pointing of two
 microsurgeons, 144 um in three dimensions (Wells et al., Comparison of baseline tremor under various
-microsurgical conditions, IEEE SMC 2013, 1482-1487, PMC3989364). Both are of surgeons: that the lower
-end is the expert's tremor and the upper the novice's is chosen. Novices exert 22.7 % more force than
-experts (Golahmadi et al., Tool-tissue forces in surgery: a systematic review, 2021, PMC8058906, mean
-of averages of 45 studies). Force goes with the depth of the dent, so theirs is deeper by as much.
+microsurgical conditions, IEEE SMC 2013, 1482-1487, PMC3989364). Both are of surgeons: that the
+lower end is the expert's tremor and the upper the novice's is chosen. Novices exert 22.7 % more
+force than experts (Golahmadi et al., Tool-tissue forces in surgery: a systematic review, 2021,
+PMC8058906, mean of averages of 45 studies). Force goes with the depth of the dent, so theirs is
+deeper by as much.
 
 Chosen, since no source gives them in these units: the novice's errors of place and depth, ten times
 the expert's; durations; pauses; how often a lump is recognised, or imagined. They were fixed before
