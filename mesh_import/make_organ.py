@@ -47,9 +47,9 @@ def pad() -> tuple[Points, NDArray[np.int32], NDArray[np.int32]]:
     return nodes, tetrahedra, np.where(top, SKIN, FAT).astype(np.int32)
 
 
-LUMPS_M = ((-0.015, -0.012, 0.014), (0.018, -0.003, 0.014), (-0.006, 0.018, 0.014))
+LUMPS_M = ((-0.015, -0.012, 0.013), (0.018, -0.003, 0.013), (-0.006, 0.018, 0.013))
 """Centres of the hard lumps in a block."""
-LUMP_RADIUS_M = 0.007
+LUMP_RADIUS_M = 0.009
 
 
 def lumpy_block() -> tuple[Points, NDArray[np.int32], NDArray[np.int32]]:
