@@ -170,13 +170,14 @@ def attempts(
     from dataclasses import asdict
 
     from cutting_trainer.recordings import attempts_command as of
+    from cutting_trainer.session.attempts import open_store
     from cutting_trainer.session.demo_command import SESSIONS
     from cutting_trainer.session.errors import SessionError
 
     bags = folder or SESSIONS
     if folder is not None and not folder.is_dir():
         raise SessionError(f'{folder} is no folder: name one with bags in it')
-    console, store = Console(), of.open_store(bags)
+    console, store = Console(), open_store(bags)
     with _working('reading new bags'):
         for problem in of.index_bags(store, bags):
             Console(stderr=True).print(f'left out: {escape(problem)}', highlight=False)

@@ -37,13 +37,11 @@ def demo(
     notes: Annotated[str, typer.Option(help='Remarks on the session; go into the bag.')] = '',
 ) -> None:
     """Run a session: an emulated arm palpates and cuts the tissue, all of it recorded."""
-    from cutting_trainer.exercises.attempt_store import new_pseudonym
     from cutting_trainer.session.demo_command import DemoOptions, run_demo
     from cutting_trainer.session.domain import parse_domain
 
-    who = subject or new_pseudonym()
     options = DemoOptions(
-        scene, seconds, bag, seed, parse_domain(domain), as_json, view, who, notes
+        scene, seconds, bag, seed, parse_domain(domain), as_json, view, subject, notes
     )
     raise typer.Exit(int(run_demo(options)))
 

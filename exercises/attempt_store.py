@@ -95,6 +95,11 @@ class AttemptStore:
         with closing(self._connect()) as connection:
             return [_row(each) for each in connection.execute(query, tuple(given.values()))]
 
+    def bags(self) -> set[str]:
+        """Return the folders of all bags in the index."""
+        with closing(self._connect()) as connection:
+            return {bag for (bag,) in connection.execute('SELECT bag FROM attempts')}
+
     def next_attempt(self, subject: str, exercise: str) -> int:
         """Return the number of the subject's next attempt at an exercise."""
         query = 'SELECT MAX(attempt) FROM attempts WHERE subject = ? AND exercise = ?'

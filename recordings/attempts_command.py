@@ -3,7 +3,6 @@
 import csv
 import math
 import shutil
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -29,27 +28,10 @@ from cutting_trainer.exercises.bag_feed import read_attempt
 from cutting_trainer.exercises.scene_schema import MEASURES
 from cutting_trainer.exercises.score import UNITS, in_words, score
 from cutting_trainer.recordings.html_report import recorded
-from cutting_trainer.session.demo_command import SESSIONS
 from cutting_trainer.session.errors import SessionError
 
-STORE_FILE = 'attempts.sqlite'
 PASS_SCORE = 70.0
 """Pass line of curves where the scenes do not agree on one."""
-
-
-def open_store(folder: Path = SESSIONS) -> AttemptStore:
-    """Return the index of a folder of bags.
-
-    Raises:
-        SessionError: its file is no index.
-    """
-    try:
-        return AttemptStore(folder.resolve() / STORE_FILE)
-    except sqlite3.DatabaseError:
-        file = folder / STORE_FILE
-        raise SessionError(
-            f'{file} is no index of attempts: delete it, and it is made anew from the bags'
-        ) from None
 
 
 def index_bags(store: AttemptStore, folder: Path) -> list[str]:

@@ -5,6 +5,7 @@ import math
 import pyarrow.parquet as pq
 import pytest
 
+from cutting_trainer.bags.writer import BagWriter
 from cutting_trainer.exercises.attempt_store import (
     AttemptRow,
     AttemptStore,
@@ -12,13 +13,12 @@ from cutting_trainer.exercises.attempt_store import (
     new_pseudonym,
 )
 from cutting_trainer.recordings.attempts_command import (
-    STORE_FILE,
     delete,
     export_rows,
     find,
     index_bags,
-    open_store,
 )
+from cutting_trainer.session.attempts import STORE_FILE, attempt_data, next_attempt, open_store
 from cutting_trainer.session.errors import SessionError
 
 
@@ -94,6 +94,20 @@ def test_a_file_that_is_no_index_is_named(tmp_path) -> None:
     (tmp_path / STORE_FILE).write_bytes(b'no index at all' * 100)
     with pytest.raises(SessionError, match='is no index'):
         open_store(tmp_path)
+
+
+def test_attempts_count_on_over_index_and_bags_that_are_not_in_it_yet(tmp_path) -> None:
+    assert attempt_data(tmp_path, 'circle', '', 'n')['attempt'] == '1'
+    store = open_store(tmp_path)
+    store.put([row(tmp_path / 'indexed', number=2), row(tmp_path / 'other', 'b', number=7)])
+    for name, subject, scene in [('1', 'a', 'circle'), ('2', 'a', 'pad'), ('3', 'b', 'circle')]:
+        data = {'subject': subject, 'attempt': '3', 'scene_file': f'{scene}.yaml'}
+        BagWriter(tmp_path / name, custom_data=data).close()
+    (tmp_path / 'damaged').mkdir()
+    (tmp_path / 'damaged' / 'metadata.yaml').write_text('no bag')
+    numbers = [next_attempt(tmp_path, who, what) for who, what in
+               [('a', 'circle'), ('a', 'pad'), ('b', 'circle'), ('c', 'circle')]]  # fmt: skip
+    assert numbers == [4, 4, 8, 1]
 
 
 def test_an_attempt_is_found_by_the_name_of_its_bag() -> None:
