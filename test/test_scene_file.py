@@ -275,7 +275,8 @@ def test_a_script_of_a_task_starts_and_ends_free_and_goes_to_what_it_must_open_o
         assert off.min() < lump.radius
     for target in task.targets:
         corners = target.corners()
-        # Seen from above, the way of the tip is the target, to a tenth of its margin.
+        # Seen from above, the way is the target in the stretched tissue, to a tenth of its margin.
+        corners *= 1 + np.array(read_section(scene, 'tissue', TissueSettings).stretch)
         assert distance_to_line(corners[:, :2], in_tissue[:, :2]).max() < 0.1 * target.margin
         ends = corners[0, 2] - in_tissue[:, 2] - tool.blade_tip[2]
         assert ends.max() > target.depth[0]

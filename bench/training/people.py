@@ -19,9 +19,8 @@ from typing import Literal
 
 import numpy as np
 
-from bench.training.player import Person, expert_script
+from bench.training.player import Person, expert_script, scene_of
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import Phase, ScriptSettings, Waypoint
-from cutting_trainer.session.scene_loader import load_scene
 
 Kind = Literal['expert', 'novice', 'nothing', 'everything', 'wild']
 SKILLED: tuple[Kind, ...] = ('expert', 'novice')
@@ -93,7 +92,7 @@ def person(scene: str, kind: Kind, seed: int) -> Person:
 
 def _touching_height(scene: str) -> float:
     """Return the height of the tip at which it touches: of surface and sphere [m]."""
-    said = load_scene(scene)
+    said = scene_of(scene)
     task = said.exercise
     if task.targets:
         return float(task.targets[0].corners()[0, 2]) + said.tool.radius
@@ -145,22 +144,22 @@ def _is_held(phase: Phase, point: Waypoint) -> bool:
 
 
 def _everything(scene: str, script: ScriptSettings) -> ScriptSettings:
-    """Return a script that cuts, or marks, the whole area of a scene in lanes."""
+    """Return a script that cuts, or marks, the whole area of a scene in lanes, in the time given."""
     points = np.array([p.position for phase in script.phases for p in phase.waypoints])
     low, high = points.min(axis=0), points.max(axis=0)
     left, right = low[0] - _BORDER_M, high[0] + _BORDER_M
     lanes = np.linspace(low[1] - _BORDER_M, high[1] + _BORDER_M, _LANES)
-    up = script.start.position[2]
+    up, task = script.start.position[2], scene_of(scene).exercise
     ways: list[Waypoint] = []
     for lane in lanes:
-        columns = np.linspace(left, right, _LANES) if load_scene(scene).exercise.lumps else None
-        if columns is None:
+        if not task.lumps:
             stops = [(left, up), (left, low[2]), (right, low[2]), (right, up)]
             ways += [Waypoint(position=(x, float(lane), float(z))) for x, z in stops]
             continue
-        for x in columns:
+        for x in np.linspace(left, right, _LANES):
             for z, share in ((up - 0.015, 1.0), (low[2], 1.0), (low[2], 3.0), (up - 0.015, 1.0)):
                 ways.append(Waypoint(position=(float(x), float(lane), float(z)), share=share))
-    kind = 'palpate' if load_scene(scene).exercise.lumps else 'cut'
-    phases = (Phase(kind=kind, waypoints=tuple(ways)),)
-    return script.model_copy(update={'phases': phases, 'seconds': 60.0})
+    phases = (Phase(kind='palpate' if task.lumps else 'cut', waypoints=tuple(ways)),)
+    # Each lump is held for half of the time of its place: that takes most of what is allowed.
+    seconds = 0.95 * task.time_limit if task.lumps else 60.0
+    return script.model_copy(update={'phases': phases, 'seconds': seconds})

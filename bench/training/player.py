@@ -1,6 +1,7 @@
 """Attempts in one process, in simulated time, by an emulated hand on an emulated arm."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compil
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import HandSettings, ScriptSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 from cutting_trainer.session.in_process import TICK_S, simulate
-from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 
 Floats = NDArray[np.float64]
 _PLACES = [ContactCodec.fields[name] for name in ('device', 'blade_root', 'blade_tip', 'state')]
@@ -33,9 +34,15 @@ class Person:
     seed: int = 0
 
 
+@cache
+def scene_of(name: str) -> Scene:
+    """Return a scene, read once."""
+    return load_scene(name)
+
+
 def expert_script(scene: str) -> Person:
     """Return the hand that the scene itself describes."""
-    arm = load_scene(scene).arm
+    arm = scene_of(scene).arm
     return Person(arm.require_script(), arm.hand)
 
 
@@ -49,7 +56,7 @@ def play(scene: str, person: Person) -> Attempt:
     Raises:
         RuntimeError: the force loop ends in a FAULT.
     """
-    said = load_scene(scene)
+    said = scene_of(scene)
     world = simulate(scene)
     script = compile_script(person.script, said.device.tissue_from_device)
     arm = EmulatedArm(said.arm, EmulatedHand(person.hand, script, person.seed))
