@@ -144,7 +144,7 @@ def _is_held(phase: Phase, point: Waypoint) -> bool:
 
 
 def _everything(scene: str, script: ScriptSettings) -> ScriptSettings:
-    """Return a script that cuts, or marks, the whole area of a scene in lanes, in the time given."""
+    """Return a script that cuts, or marks, the whole area of a scene in lanes, in its time."""
     points = np.array([p.position for phase in script.phases for p in phase.waypoints])
     low, high = points.min(axis=0), points.max(axis=0)
     left, right = low[0] - _BORDER_M, high[0] + _BORDER_M
