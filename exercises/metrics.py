@@ -108,6 +108,13 @@ class Attempt:
         values.update(self._of_marks(motion, forces))
         return values
 
+    @property
+    def broken_off(self) -> bool:
+        """Whether the tip touched tissue and was not back at the end when the samples ended."""
+        motion = np.concatenate([np.zeros((0, 11)), *self._motion])
+        touched = np.flatnonzero(motion[:, 10] > 0)
+        return bool(self.exercise.end and len(touched) and self._back(motion, touched[-1]) is None)
+
     def marks(self) -> Floats:
         """Return the places that were marked [m], shape (h, 3)."""
         return self._marks(*self._during())
@@ -130,12 +137,19 @@ class Attempt:
         last = len(motion) - 1
         touched = np.flatnonzero(motion[:, 10] > 0)
         if exercise.end and len(touched):
-            off = np.linalg.norm(motion[:, 1:4] - exercise.end.centre, axis=1)
-            back = np.flatnonzero(off[touched[-1] :] <= exercise.end.radius)
-            last = int(touched[-1] + back[0]) if len(back) else last
+            back = self._back(motion, touched[-1])
+            last = last if back is None else back
         motion = motion[first : last + 1]
         within = (forces[:, 0] >= motion[0, 0]) & (forces[:, 0] <= motion[-1, 0])
         return motion, forces[within]
+
+    def _back(self, motion: Floats, touched: int) -> int | None:
+        """Return the sample of the return to the end after the last touch; None: there is none."""
+        end = self.exercise.end
+        assert end is not None
+        off = np.linalg.norm(motion[touched:, 1:4] - end.centre, axis=1)
+        back = np.flatnonzero(off <= end.radius)
+        return int(touched + back[0]) if len(back) else None
 
     def _of_motion(self, motion: Floats) -> dict[MeasureName, float]:
         if len(motion) < 2:

@@ -4,7 +4,7 @@ import csv
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,8 @@ def index_bags(store: AttemptStore, folder: Path) -> list[str]:
         Sentences about bags that cannot be read.
     """
     store.mark_missing()
-    known = {row.bag: row for row in store.rows() if row.state not in ('broken off', 'bag is gone')}
+    # A bag that was not closed has no measures, and may have been repaired since.
+    known = {row.bag for row in store.rows() if row.measures and row.state != 'bag is gone'}
     problems = []
     for metadata in sorted(folder.resolve().glob(f'*/{METADATA_FILE}')):
         bag = metadata.parent
@@ -82,15 +83,13 @@ def attempt_of(folder: Path, store: AttemptStore) -> AttemptRow | None:
     )
     if not bag.complete:
         return row
-    measures = read_attempt(bag, scene.exercise).measures()
+    made = read_attempt(bag, scene.exercise)
+    measures = made.measures()
+    row = replace(row, measures={str(name): value for name, value in measures.items()})
+    if made.broken_off:
+        return replace(row, state='broken off')
     got = score(scene.exercise, measures)
-    scored: dict[str, Any] = {
-        'points': got.points,
-        'passed': got.passed,
-        'reasons': tuple(got.reasons),
-        'measures': {str(name): value for name, value in measures.items()},
-    }
-    return AttemptRow(**{**asdict(row), **scored})
+    return replace(row, points=got.points, passed=got.passed, reasons=tuple(got.reasons))
 
 
 def plain(row: AttemptRow) -> dict[str, Any]:
@@ -100,7 +99,8 @@ def plain(row: AttemptRow) -> dict[str, Any]:
 
 def list_table(rows: Sequence[AttemptRow]) -> Table:
     """Return the attempts as a table."""
-    table = Table('begun (UTC)', 'subject', 'exercise', 'attempt', 'points', 'result', 'bag')
+    table = Table('begun (UTC)', 'subject', 'exercise', 'attempt', 'points', 'result')
+    table.add_column('bag', overflow='fold')  # the name is what `--compare` takes
     for row in rows:
         begun = datetime.fromtimestamp(row.begun, UTC)
         result = ('passed' if row.passed else 'failed') if row.state == 'scored' else row.state

@@ -167,9 +167,9 @@ def _exercise(bag: Bag, scene: Scene | None) -> list[str]:
     """Return the score of an attempt and its reasons; nothing where the scene is no exercise."""
     if scene is None or not scene.exercise.title:
         return []
-    measures = read_attempt(bag, scene.exercise).measures()
-    got = score(scene.exercise, measures)
-    verdict = 'passed' if got.passed else 'failed'
+    attempt = read_attempt(bag, scene.exercise)
+    got = score(scene.exercise, attempt.measures())
+    verdict = 'broken off' if attempt.broken_off else 'passed' if got.passed else 'failed'
     rows: list[tuple[str, ...]] = [
         (UNITS[each.measure][2], in_words(each.measure, each.value), f'{each.given:.1f}')
         for each in got.deductions

@@ -234,6 +234,20 @@ def test_score_is_in_proportion_and_says_why(coverage, time, points, passed, rea
     assert len(got.reasons) == reasons
 
 
+def test_an_attempt_is_broken_off_until_the_tip_is_back_at_its_end() -> None:
+    end = BallSettings(name='end', centre=(0, 0, 0.05), radius=0.005)
+    attempt = Attempt(exercise().model_copy(update={'end': end}))
+    assert not attempt.broken_off  # nothing was touched: there is nothing to break off
+    motion = np.zeros((300, 11))
+    motion[:, 0] = np.arange(300) / RATE_HZ
+    motion[100:200, 10] = 1
+    attempt.add_motion(motion[:250])
+    assert attempt.broken_off
+    motion[250:, 3] = 0.05
+    attempt.add_motion(motion[250:])
+    assert not attempt.broken_off
+
+
 def test_measures_do_not_depend_on_how_samples_were_batched() -> None:
     random = np.random.default_rng(4)
     motion = np.cumsum(random.normal(size=(3000, 11)) * 1e-4, axis=0)
