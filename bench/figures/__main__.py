@@ -70,10 +70,12 @@ SUBJECTS = {
         modules=('training',),
         not_covered={
             1: 'it needs a browser and the page',
-            2: 'in part: all exercises take half an hour: `python -m bench.training -o FILE`',
+            2: 'of it: circle, pad and excision, those who cut everything, and 40 attempts of each '
+            'kind: an hour or more by `python -m bench.training -o FILE`',
             3: 'it needs eyes that have not seen the code',
             4: 'it needs a browser',
             5: 'it needs a browser',
+            6: 'of it: a crash in an attempt, tested by hand alone',
         },
     ),
     'trust': Subject(
