@@ -1,17 +1,24 @@
 """Claims about the index of attempts: filters, curves, missing bags, deletion, export."""
 
+import json
 import math
+import shutil
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
+from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.bags.writer import BagWriter
+from cutting_trainer.cli.main import main
 from cutting_trainer.exercises.attempt_store import (
     AttemptRow,
     AttemptStore,
     learning_curves,
     new_pseudonym,
 )
+from cutting_trainer.node_common.share_folder import PACKAGES
 from cutting_trainer.recordings.attempts_command import (
     delete,
     export_rows,
@@ -20,6 +27,8 @@ from cutting_trainer.recordings.attempts_command import (
 )
 from cutting_trainer.session.attempts import STORE_FILE, attempt_data, next_attempt, open_store
 from cutting_trainer.session.errors import SessionError
+
+SAMPLE = PACKAGES / 'bags' / 'samples' / 'format_6' / 'straight_cut'
 
 
 def row(bag, subject='a', points=50.0, number=1, exercise='circle') -> AttemptRow:
@@ -118,3 +127,45 @@ def test_an_attempt_is_found_by_the_name_of_its_bag() -> None:
 
 def test_pseudonyms_differ() -> None:
     assert len({new_pseudonym() for _ in range(100)}) > 95
+
+
+EXERCISE = """
+exercise:
+  title: A line
+  targets: [{name: line, points: [[-0.02, 0, 0.01], [0.02, 0, 0.01]], depth: [0.001, 0.02]}]
+  criteria: [{measure: time, good: 1, bad: 1000}]
+"""
+
+
+def exercised(folder: Path, number: int) -> Path:
+    """A recorded cut, as if its scene were an exercise."""
+    shutil.copytree(SAMPLE, folder)
+    file = folder / METADATA_FILE
+    content = yaml.safe_load(file.read_text(encoding='utf-8'))
+    data = content['rosbag2_bagfile_information']['custom_data']
+    data['scene'] += EXERCISE
+    data.update(subject='SUBJECT', attempt=str(number))
+    file.write_text(yaml.safe_dump(content), encoding='utf-8')
+    return folder
+
+
+def test_the_command_lists_compares_exports_and_deletes(tmp_path, capsys) -> None:
+    one, two = exercised(tmp_path / 'one', 1), exercised(tmp_path / 'two', 2)
+
+    def attempts(*options: str) -> str:
+        with pytest.raises(SystemExit) as ended:
+            main(['attempts', str(tmp_path), *options])
+        assert not ended.value.code
+        return capsys.readouterr().out
+
+    listed = json.loads(attempts('--json'))
+    assert [row['attempt'] for row in listed] == [1, 2]
+    assert [row['state'] for row in listed] == ['scored', 'scored']
+    assert 90 < listed[0]['points'] < 100
+    assert 'SUBJECT' in attempts()
+    assert 'peak force' in attempts('--compare', 'one', 'two')
+    assert json.loads(attempts('--curves', '--json'))[0]['attempts'] == [1, 2]
+    attempts('-o', str(tmp_path / 'attempts.csv'))
+    assert len((tmp_path / 'attempts.csv').read_text(encoding='utf-8').splitlines()) == 3
+    assert json.loads(attempts('--delete', 'SUBJECT', '--json'))['deleted'] == [str(one), str(two)]
+    assert not one.exists() and not two.exists() and json.loads(attempts('--json')) == []
