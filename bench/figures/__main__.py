@@ -70,7 +70,7 @@ SUBJECTS = {
         modules=('training',),
         not_covered={
             1: 'it needs a browser and the page',
-            2: 'of it: circle, pad and excision, those who cut everything, and 40 attempts of each '
+            2: 'of it: the other four exercises, those who cut everything, and 40 attempts of each '
             'kind: an hour or more by `python -m bench.training -o FILE`',
             3: 'it needs eyes that have not seen the code',
             4: 'it needs a browser',
