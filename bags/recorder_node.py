@@ -104,6 +104,7 @@ class Recorder(ManagedNode):
         bag: folder of the new bag.
         scene: scene file, whose text goes into the bag; none when empty.
         seed: of the session; goes into the bag.
+        subject, attempt, notes: pseudonym, number of the attempt and remarks; go into the bag.
         account_as_json: report the counts of all messages at the end, as JSON for the launcher.
         max_message: largest number of bytes of a recorded message, meshes included.
     """
@@ -123,7 +124,8 @@ class Recorder(ManagedNode):
         scene, seed = scene_parameter(self), seed_parameter(self)
         text = 'report the counts of all messages at the end in lines of JSON'
         self._as_json = bool(parameter(self, 'account_as_json', False, text))
-        self.writer = BagWriter(self._folder(Path(folder)), custom_data=_custom_data(scene, seed))
+        data = _custom_data(scene, seed) | self._attempt()
+        self.writer = BagWriter(self._folder(Path(folder)), custom_data=data)
         self._steady = SteadyClock()
         self._streams: dict[str, _Stream] = {}
         self._unrecorded: dict[str, str] = {}
@@ -139,6 +141,16 @@ class Recorder(ManagedNode):
             self.resolve_topic_name(name): profile.depth for name, profile in CONFIGURED.items()
         }
         self._diagnostics = Diagnostics(self, self._collect)
+
+    def _attempt(self) -> dict[str, str]:
+        """Return who made the attempt, as far as it is said, for the bag."""
+        texts = {
+            'subject': 'pseudonym of the trainee',
+            'attempt': 'number of the attempt, from 1',
+            'notes': 'remarks on the session',
+        }
+        given = {name: str(parameter(self, name, '', text)) for name, text in texts.items()}
+        return {name: value for name, value in given.items() if value}
 
     def _folder(self, asked: Path) -> Path:
         """Return the requested folder; or, where it exists, a new one named after it."""

@@ -12,6 +12,7 @@ ROOMS = (
     'haptic_bridge',
     'cutting',
     'bags',
+    'exercises',
     'viewer',
     'session',
     'recordings',

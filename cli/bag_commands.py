@@ -145,6 +145,67 @@ def repair(bag: BagArgument, as_json: AsJson = False) -> None:
         mend(bag, as_json=as_json)
 
 
+@commands.command(epilog=EXIT_STATUSES)
+def attempts(
+    folder: Annotated[
+        Path | None, typer.Argument(help='Folder of the bags (default: bags/sessions).')
+    ] = None,
+    subject: Annotated[str, typer.Option(help='Only this subject.')] = '',
+    exercise: Annotated[str, typer.Option(help='Only this exercise: name of its scene.')] = '',
+    compare: Annotated[
+        tuple[str, str] | None, typer.Option(help='Compare the attempts of two bags.')
+    ] = None,
+    curves: Annotated[
+        bool, typer.Option('--curves', help='Learning curves by subject and exercise.')
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option('--output', '-o', help='Write .csv or .parquet.')
+    ] = None,
+    delete: Annotated[
+        str, typer.Option(help='Delete this subject: rows of the index and bags in the folder.')
+    ] = '',
+    as_json: AsJson = False,
+) -> None:
+    """List scored attempts at exercises, compare two, draw curves, export, delete a subject."""
+    from dataclasses import asdict
+
+    from cutting_trainer.recordings import attempts_command as of
+    from cutting_trainer.session.attempts import open_store
+    from cutting_trainer.session.demo_command import SESSIONS
+    from cutting_trainer.session.errors import SessionError
+
+    bags = folder or SESSIONS
+    if folder is not None and not folder.is_dir():
+        raise SessionError(f'{folder} is no folder: name one with bags in it')
+    console, store = Console(), open_store(bags)
+    with _working('reading new bags'):
+        for problem in of.index_bags(store, bags):
+            Console(stderr=True).print(f'left out: {escape(problem)}', highlight=False)
+    if delete:
+        gone = of.delete(store, bags, delete)
+        _tell({'deleted': gone} if as_json else f'deleted, with {len(gone)} bags', as_json=as_json)
+        return
+    rows = store.rows(subject, exercise)
+    if output is not None:
+        of.export_rows(rows, output)
+        _tell_written([output], as_json=as_json)
+    elif compare is not None:
+        one, two = (of.find(rows, name) for name in compare)
+        both = [of.plain(one), of.plain(two)]
+        _tell(both, as_json=True) if as_json else console.print(of.comparison_table(one, two))
+    elif curves:
+        found, table = of.curves_table(rows)
+        _tell([asdict(c) for c in found], as_json=True) if as_json else console.print(table)
+    elif as_json:
+        _tell([of.plain(row) for row in rows], as_json=True)
+    else:
+        console.print(of.list_table(rows))
+
+
+def _tell(outcome: object, *, as_json: bool) -> None:
+    print(json.dumps(outcome, indent=2) if as_json else outcome)
+
+
 def _working(what: str) -> Status:
     """Show that something is under way, on a terminal, as long as the context lasts."""
     return Console(stderr=True).status(what)

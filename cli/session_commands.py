@@ -31,12 +31,18 @@ def demo(
     view: Annotated[
         bool, typer.Option('--view', help='Serve a page that shows the session (see view).')
     ] = False,
+    subject: Annotated[
+        str, typer.Option(help='Pseudonym of who makes the attempt (default: a new one).')
+    ] = '',
+    notes: Annotated[str, typer.Option(help='Remarks on the session; go into the bag.')] = '',
 ) -> None:
     """Run a session: an emulated arm palpates and cuts the tissue, all of it recorded."""
     from cutting_trainer.session.demo_command import DemoOptions, run_demo
     from cutting_trainer.session.domain import parse_domain
 
-    options = DemoOptions(scene, seconds, bag, seed, parse_domain(domain), as_json, view)
+    options = DemoOptions(
+        scene, seconds, bag, seed, parse_domain(domain), as_json, view, subject, notes
+    )
     raise typer.Exit(int(run_demo(options)))
 
 

@@ -47,6 +47,19 @@ def pad() -> tuple[Points, NDArray[np.int32], NDArray[np.int32]]:
     return nodes, tetrahedra, np.where(top, SKIN, FAT).astype(np.int32)
 
 
+LUMPS_M = ((-0.015, -0.012, 0.013), (0.018, -0.003, 0.013), (-0.006, 0.018, 0.013))
+"""Centres of the hard lumps in a block."""
+LUMP_RADIUS_M = 0.009
+
+
+def lumpy_block() -> tuple[Points, NDArray[np.int32], NDArray[np.int32]]:
+    """Return a block with hidden lumps: nodes [m], shape (n, 3); tetrahedra and their labels."""
+    nodes, tetrahedra = block((12, 12, 4), 0.006)
+    middles = nodes[tetrahedra].mean(axis=1)
+    off = np.linalg.norm(middles[:, None] - np.array(LUMPS_M), axis=2).min(axis=1)
+    return nodes, tetrahedra, np.where(off < LUMP_RADIUS_M, 2, 1).astype(np.int32)
+
+
 def block(cells: tuple[int, int, int], size: float) -> tuple[Points, NDArray[np.int32]]:
     """Return a block of cubes, each split into six tetrahedra around its diagonal (Kuhn).
 
@@ -241,6 +254,8 @@ def main() -> None:
     _write(folder / 'slab.msh', *block((12, 12, 5), 0.008))
     _write(folder / 'flap.msh', *block((12, 5, 3), 0.01 / 3))
     _write(folder / 'pad.msh', *pad())
+    _write(folder / 'sheet.msh', *block((24, 24, 1), 0.004))
+    _write(folder / 'lumps.msh', *lumpy_block())
     _write(folder / 'liver.msh', *organ())
     _write(folder / 'liver_suspended.msh', *graded_organ())
 

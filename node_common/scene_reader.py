@@ -27,7 +27,7 @@ from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.node_common.rejections import MAX_TOOLS
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError, check_events, read_bounded
 
-SECTIONS = ('tissue', 'tool', 'device', 'haptics', 'cutting', 'arm', 'session')
+SECTIONS = ('tissue', 'tool', 'device', 'haptics', 'cutting', 'arm', 'session', 'exercise')
 TOOLS = 'tools'
 """Section of the further tools in the tissue, by the namespace of their bridge and arm. The keys of
 each replace those of the sections of the first tool."""

@@ -20,6 +20,8 @@ from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.recorded_tissue import first_tissue, tissue_at
 from cutting_trainer.bags.repair import repair_note
 from cutting_trainer.bags.topic_names import CUTS, POSE, of_session
+from cutting_trainer.exercises.bag_feed import read_attempt
+from cutting_trainer.exercises.score import UNITS, in_words, score
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ScriptSettings
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec
@@ -126,6 +128,7 @@ def _body(
         f'<h1>Session {escape(Path(summary.bag).resolve().name)}</h1>',
         f'<p class="note">{begun:%Y-%m-%d %H:%M:%S} UTC, {summary.duration:.1f} s; {about}</p>',
         _table(_numbers(story, summary, depth)),
+        *_exercise(bag, scene),
         '<h2>The cut</h2>',
         _table(_cut_numbers(bag, story, depth, tool, script)),
         _image(_path_figure(story, script), 'Path of the tip from above, and the plan.'),
@@ -157,6 +160,24 @@ def _numbers(story: Story, summary: Summary, depth: Floats) -> list[tuple[str, .
         ('mean force in contact [N]', f'{_mean_force(story):.2f}'),
         ("largest depth of the blade's end [mm]", f'{depth.max(initial=0.0) * _MM:.1f}'),
         ('tetrahedra taken out by cuts', str(summary.elements_cut)),
+    ]
+
+
+def _exercise(bag: Bag, scene: Scene | None) -> list[str]:
+    """Return the score of an attempt and its reasons; nothing where the scene is no exercise."""
+    if scene is None or not scene.exercise.title:
+        return []
+    attempt = read_attempt(bag, scene.exercise)
+    got = score(scene.exercise, attempt.measures())
+    verdict = 'broken off' if attempt.broken_off else 'passed' if got.passed else 'failed'
+    rows: list[tuple[str, ...]] = [
+        (UNITS[each.measure][2], in_words(each.measure, each.value), f'{each.given:.1f}')
+        for each in got.deductions
+    ]
+    return [
+        f'<h2>{escape(scene.exercise.title)}: {verdict} with {got.points:.0f} points</h2>',
+        _table(rows, ('measure', 'value', 'points')),
+        ''.join(f'<p class="note">{escape(reason)}</p>' for reason in got.reasons),
     ]
 
 

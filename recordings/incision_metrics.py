@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from cutting_trainer.exercises.opened_tissue import distance_to_line
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ScriptSettings
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
@@ -47,13 +48,5 @@ def extent(path: Floats) -> float:
 
 def distance_to_paths(points: Floats, paths: list[Floats]) -> Floats:
     """Return the distance of each point to the nearest path, seen along z [m], shape (p,)."""
-    points = points[:, :2]
-    begins = np.concatenate([path[:-1, :2] for path in paths])
-    along = np.concatenate([np.diff(path[:, :2], axis=0) for path in paths])
-    square = np.maximum((along**2).sum(axis=1), 1e-300)
-    nearest = np.full(len(points), np.inf)
-    for begin, direction, size in zip(begins, along, square, strict=True):
-        share = np.clip((points - begin) @ direction / size, 0.0, 1.0)
-        off = np.linalg.norm(points - begin - share[:, None] * direction, axis=1)
-        nearest = np.minimum(nearest, off)
-    return nearest
+    seen = [distance_to_line(points[:, :2], path[:, :2]) for path in paths]
+    return np.asarray(np.min(seen, axis=0))

@@ -15,6 +15,7 @@ from cutting_trainer.bags.errors import BagError
 from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
 from cutting_trainer.node_common.share_folder import PACKAGES, is_checkout
 from cutting_trainer.session.acceptance_criteria import Expected, judge
+from cutting_trainer.session.attempts import attempt_data
 from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.errors import SessionError
@@ -57,6 +58,8 @@ class DemoOptions:
         domain: ROS domain, or `free`.
         as_json: print the summary as JSON.
         view: serve a page on this machine with a view of the session.
+        subject: pseudonym of who makes the attempt; empty: a new one for an exercise.
+        notes: remarks on the session.
     """
 
     scene: str
@@ -66,6 +69,8 @@ class DemoOptions:
     domain: int | Literal['free']
     as_json: bool
     view: bool = False
+    subject: str = ''
+    notes: str = ''
 
 
 def run_demo(options: DemoOptions) -> Status:
@@ -78,7 +83,10 @@ def run_demo(options: DemoOptions) -> Status:
     seconds = script_seconds(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)
     tools = [tool.label for tool in scene.others]
-    nodes = session_nodes(scene.path, bag, options.seed, seconds, tools)
+    said = {'subject': options.subject, 'notes': options.notes}
+    if scene.exercise.title:
+        said = attempt_data(bag.parent, scene.name, options.subject, options.notes)
+    nodes = session_nodes(scene.path, bag, options.seed, seconds, tools, said)
     if options.view:
         nodes.insert(0, viewer_command(scene.path, LOCAL, page_port(), session=False))
     notes = session_console()

@@ -47,7 +47,12 @@ RANGE, PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FI
 
 
 def session_nodes(
-    scene: Path, bag: Path, seed: int, seconds: float, tools: Sequence[str] = ()
+    scene: Path,
+    bag: Path,
+    seed: int,
+    seconds: float,
+    tools: Sequence[str] = (),
+    attempt: Mapping[str, object] | None = None,
 ) -> list[NodeCommand]:
     """Return commands for the five nodes, and arm and bridge of each further tool.
 
@@ -57,6 +62,7 @@ def session_nodes(
         seed: seed of all random numbers.
         seconds: duration of the arm's script [s].
         tools: names of the further tools of the scene.
+        attempt: subject, attempt and notes, parameters of the recorder.
     """
     own: dict[str, dict[str, object]] = {
         ARM_NODE: {'seconds': float(seconds)},
@@ -64,7 +70,7 @@ def session_nodes(
     }
     common = {'scene': str(scene), 'seed': seed}
     commands = _nodes(common, own, tools)
-    return [*commands, recorder_command(scene, bag, seed)]
+    return [*commands, recorder_command(scene, bag, seed, attempt)]
 
 
 def simulation_nodes(

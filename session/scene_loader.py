@@ -6,6 +6,7 @@ from pathlib import Path
 from pydantic import Field
 
 from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
 from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
@@ -60,6 +61,7 @@ class Scene:
         name: name of the file, without its extension.
         path: the file.
         profile: limits of the device that the scene names.
+        exercise: the task; without a title the scene is none.
         others: the further tools, in their order.
     """
 
@@ -73,6 +75,7 @@ class Scene:
     cutting: CuttingSettings
     arm: ArmSettings
     session: SessionSettings
+    exercise: ExerciseSettings
     others: tuple[SceneTool, ...] = ()
 
     @property
@@ -105,6 +108,7 @@ def load_scene(scene: str) -> Scene:
         cutting=read_section(path, 'cutting', CuttingSettings),
         arm=first.arm,
         session=read_section(path, 'session', SessionSettings),
+        exercise=read_section(path, 'exercise', ExerciseSettings),
         others=tuple(_load_tool(path, name) for name in tool_names(path)),
     )
 

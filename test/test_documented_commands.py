@@ -148,6 +148,21 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     'python -m bench.cuts.loose_pieces': Nowhere(
         'takes minutes: test_pieces.py does it to fewer pieces'
     ),
+    './trainer run python -m bench.training -o rows.jsonl -n 40': Nowhere(
+        'takes an hour: test_training_bench.py tries its parts'
+    ),
+    **{
+        f'./trainer attempts{options}': Elsewhere(
+            'test_attempt_store.py::test_the_command_lists_compares_exports_and_deletes'
+        )
+        for options in (
+            '',
+            ' --compare BAG BAG',
+            ' --curves',
+            ' -o attempts.csv',
+            ' --delete SUBJECT',
+        )
+    },
     './trainer clean': Elsewhere('test_launcher.py::test_clean_leaves_nothing_but_the_lock'),
     './trainer record -o BAG --scene block': Elsewhere(
         'test_bags_live.py::'

@@ -18,6 +18,7 @@ LAYERS = (
     ('tissue_sim',),
     ('haptic_bridge', 'cutting'),
     ('bags',),
+    ('exercises',),
     ('viewer',),
     ('session',),
     ('recordings', 'mesh_import'),

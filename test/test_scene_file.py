@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cutting_trainer.exercises.opened_tissue import distance_to_line
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
 from cutting_trainer.haptic_bridge.scene_schema import (
@@ -17,6 +19,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
 )
 from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.node_common.scene_reader import SECTIONS, TOOLS, SceneModel, read_section
+from cutting_trainer.session.scene_loader import SessionSettings
 from cutting_trainer.tissue_sim.assembly import load_tissue
 from cutting_trainer.tissue_sim.mesh.checks import FACES
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
@@ -24,6 +27,9 @@ from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 pytestmark = pytest.mark.long
 
 SCENES = Path(__file__).resolve().parents[1] / 'config' / 'scenes'
+TASKS = ('circle', 'excision', 'lumps', 'vessel')
+"""Scenes that are an exercise alone: their scripts go to their targets and press nowhere else."""
+DEMONSTRATIONS = [path for path in sorted(SCENES.glob('*.yaml')) if path.stem not in TASKS]
 
 GOOD = """\
 tissue:
@@ -194,14 +200,15 @@ def test_a_missing_section_means_the_defaults(tmp_path):
 @pytest.mark.parametrize('scene', sorted(SCENES.glob('*.yaml')), ids=lambda path: path.stem)
 def test_a_shipped_scene_is_complete_and_valid(scene):
     keys = re.findall(r'^(\w+):', scene.read_text(encoding='utf-8'), flags=re.MULTILINE)
-    assert set(keys) - {TOOLS} == set(SECTIONS)
+    assert {*keys, 'exercise'} - {TOOLS} == set(SECTIONS)  # which a scene may lack
     tissue = read_section(scene, 'tissue', TissueSettings)
     tool = read_section(scene, 'tool', ToolSettings)
     device = read_section(scene, 'device', DeviceSettings)
     haptics = read_section(scene, 'haptics', HapticsSettings)
     arm = read_section(scene, 'arm', ArmSettings)
     check_together(tool, device, haptics, device.load_profile())
-    assert compile_script(arm.script, device.tissue_from_device).seconds == pytest.approx(20)
+    seconds = read_section(scene, 'session', SessionSettings).seconds
+    assert compile_script(arm.script, device.tissue_from_device).seconds == pytest.approx(seconds)
     _, _, fixed, _ = load_tissue(tissue)
     assert 10 < fixed.sum() <= len(fixed) / 2
 
@@ -223,7 +230,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-@pytest.mark.parametrize('scene', sorted(SCENES.glob('*.yaml')), ids=lambda path: path.stem)
+@pytest.mark.parametrize('scene', DEMONSTRATIONS, ids=lambda path: path.stem)
 def test_a_shipped_script_starts_free_presses_three_places_and_cuts_inside_if_at_all(scene):
     tool = read_section(scene, 'tool', ToolSettings)
     script = read_section(scene, 'arm', ArmSettings).script
@@ -247,6 +254,32 @@ def test_a_shipped_script_starts_free_presses_three_places_and_cuts_inside_if_at
         assert max(ends) < 0.015
         assert np.linalg.norm(np.diff(inside, axis=0), axis=1).sum() >= 0.03
     assert depth(positions[-1][1][-1]) < -0.02
+
+
+@pytest.mark.parametrize('name', TASKS)
+def test_a_script_of_a_task_starts_and_ends_free_and_goes_to_what_it_must_open_or_mark(name):
+    scene = SCENES / f'{name}.yaml'
+    tool = read_section(scene, 'tool', ToolSettings)
+    script = read_section(scene, 'arm', ArmSettings).script
+    task = read_section(scene, 'exercise', ExerciseSettings)
+
+    def depth(p):
+        return height(scene, p[0], p[1]) + tool.radius - p[2]
+
+    places = [w.position for phase in script.phases for w in phase.waypoints]
+    for end in (script.start.position, places[-1]):
+        assert depth(end) < -0.015
+    in_tissue = np.array([p for p in places if depth(p) > 0])
+    for lump in task.lumps:
+        off = np.linalg.norm(in_tissue[:, :2] - lump.centre[:2], axis=1)
+        assert off.min() < lump.radius
+    for target in task.targets:
+        corners = target.corners()
+        # Seen from above, the way is the target in the stretched tissue, to a tenth of its margin.
+        corners *= 1 + np.array(read_section(scene, 'tissue', TissueSettings).stretch)
+        assert distance_to_line(corners[:, :2], in_tissue[:, :2]).max() < 0.1 * target.margin
+        ends = corners[0, 2] - in_tissue[:, 2] - tool.blade_tip[2]
+        assert ends.max() > target.depth[0]
 
 
 def test_settings_name_range_and_unit_of_every_number():

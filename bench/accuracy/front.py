@@ -12,12 +12,16 @@ from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 PANELS = {
     'block': ('indentation', 'after_cut'),
+    'circle': ('large_rotation',),
+    'excision': ('large_rotation',),
     'flap': ('large_rotation',),
     'liver': ('large_strain',),
     'liver_suspended': ('large_strain',),
     'pad': ('large_strain',),
+    'lumps': ('indentation',),
     'palpation': ('indentation',),
     'two_tools': ('large_strain',),
+    'vessel': ('large_rotation',),
 }
 """Problems of the chart that resemble a scene."""
 

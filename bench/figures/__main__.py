@@ -66,6 +66,18 @@ SUBJECTS = {
             7: 'it takes minutes: `./trainer validate`',
         },
     ),
+    'training': Subject(
+        modules=('training',),
+        not_covered={
+            1: 'it needs a browser and the page',
+            2: 'of it: the other four exercises, those who cut everything, and 40 attempts of each '
+            'kind: an hour or more by `python -m bench.training -o FILE`',
+            3: 'it needs eyes that have not seen the code',
+            4: 'it needs a browser',
+            5: 'it needs a browser',
+            6: 'of it: a crash in an attempt, tested by hand alone',
+        },
+    ),
     'trust': Subject(
         modules=('trust_bridge', 'trust_output'),
         together=('trust_page', 'trust_files'),

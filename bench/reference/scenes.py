@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.node_common.scene_reader import SECTIONS
@@ -30,6 +31,7 @@ MODELS: dict[str, type[BaseModel]] = {
     'cutting': CuttingSettings,
     'arm': ArmSettings,
     'session': SessionSettings,
+    'exercise': ExerciseSettings,
 }
 FILE = PACKAGES / 'docs' / 'scenes.md'
 MARK = '<!-- Below: written by `python -m bench.reference.scenes` from the models. -->\n'
@@ -125,6 +127,8 @@ def _value(field: FieldInfo, meaning: str) -> str:
         item = get_args(kind)[0]
         if item is str:
             return 'words'
+        if get_origin(item) is tuple:
+            return 'points'
         if get_origin(getattr(item, '__origin__', None)) is tuple:
             return 'pairs of numbers'
         limits = _limits(item.__metadata__[0].metadata) if hasattr(item, '__metadata__') else ''

@@ -1,0 +1,188 @@
+"""`trainer attempts`: index bags, list, compare, draw curves, export, delete by subject."""
+
+import csv
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import parquet as pq
+from rich.markup import escape
+from rich.table import Table
+
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.metadata import METADATA_FILE
+from cutting_trainer.bags.playback_messages import first_time
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.exercises.attempt_store import (
+    AttemptRow,
+    AttemptStore,
+    LearningCurve,
+    learning_curves,
+)
+from cutting_trainer.exercises.bag_feed import read_attempt
+from cutting_trainer.exercises.scene_schema import MEASURES
+from cutting_trainer.exercises.score import UNITS, in_words, score
+from cutting_trainer.recordings.html_report import recorded
+from cutting_trainer.session.errors import SessionError
+
+PASS_SCORE = 70.0
+"""Pass line of curves where the scenes do not agree on one."""
+
+
+def index_bags(store: AttemptStore, folder: Path) -> list[str]:
+    """Add the bags of a folder that the index does not have, and note those that are gone.
+
+    Returns:
+        Sentences about bags that cannot be read.
+    """
+    store.mark_missing()
+    # A bag that was not closed has no measures, and may have been repaired since.
+    known = {row.bag for row in store.rows() if row.measures and row.state != 'bag is gone'}
+    problems = []
+    for metadata in sorted(folder.resolve().glob(f'*/{METADATA_FILE}')):
+        bag = metadata.parent
+        if str(bag) in known:
+            continue
+        try:
+            row = attempt_of(bag, store)
+        except (BagError, ValueError) as error:
+            problems.append(f'{bag}: {" ".join(str(error).split())}')
+            continue
+        if row is not None:
+            store.put([row])
+    return problems
+
+
+def attempt_of(folder: Path, store: AttemptStore) -> AttemptRow | None:
+    """Return the attempt that a bag records, scored; None: its scene is no exercise.
+
+    Raises:
+        BagError: it is not a bag.
+    """
+    bag = open_bag(folder)
+    scene = recorded(bag)
+    if scene is None or not scene.exercise.title:
+        return None
+    data = bag.custom_data
+    subject, exercise = data.get('subject', 'unknown'), scene.name
+    number = data.get('attempt', '')
+    attempt = int(number) if number.isdigit() and int(number) else 0
+    row = AttemptRow(
+        bag=str(folder),
+        subject=subject,
+        exercise=exercise,
+        attempt=attempt or store.next_attempt(subject, exercise),
+        begun=first_time(bag) * 1e-9,
+        state='scored' if bag.complete else 'broken off',
+        notes=data.get('notes', ''),
+    )
+    if not bag.complete:
+        return row
+    made = read_attempt(bag, scene.exercise)
+    measures = made.measures()
+    row = replace(row, measures={str(name): value for name, value in measures.items()})
+    if made.broken_off:
+        return replace(row, state='broken off')
+    got = score(scene.exercise, measures)
+    return replace(row, points=got.points, passed=got.passed, reasons=tuple(got.reasons))
+
+
+def plain(row: AttemptRow) -> dict[str, Any]:
+    """Return a row for JSON: NaN is null."""
+    return asdict(row) | {'points': None if math.isnan(row.points) else row.points}
+
+
+def list_table(rows: Sequence[AttemptRow]) -> Table:
+    """Return the attempts as a table."""
+    table = Table('begun (UTC)', 'subject', 'exercise', 'attempt', 'points', 'result')
+    table.add_column('bag', overflow='fold')  # the name is what `--compare` takes
+    for row in rows:
+        begun = datetime.fromtimestamp(row.begun, UTC)
+        result = ('passed' if row.passed else 'failed') if row.state == 'scored' else row.state
+        points = '' if math.isnan(row.points) else f'{row.points:.1f}'
+        name = Path(row.bag).name
+        table.add_row(
+            f'{begun:%Y-%m-%d %H:%M:%S}', escape(row.subject), escape(row.exercise),
+            str(row.attempt), points, result, escape(name),
+        )  # fmt: skip
+    return table
+
+
+def comparison_table(one: AttemptRow, two: AttemptRow) -> Table:
+    """Return two attempts side by side, a row for each measure that one of them has."""
+    table = Table('measure', escape(Path(one.bag).name), escape(Path(two.bag).name))
+    table.add_row('points', f'{one.points:.1f}', f'{two.points:.1f}')
+    for name in MEASURES:
+        values = [row.measures.get(name, math.nan) for row in (one, two)]
+        if not all(map(math.isnan, values)):
+            table.add_row(UNITS[name][2], *(in_words(name, value) for value in values))
+    return table
+
+
+def find(rows: Sequence[AttemptRow], bag: str) -> AttemptRow:
+    """Return the attempt of a bag, by the folder's name or path.
+
+    Raises:
+        SessionError: there is none.
+    """
+    named = [row for row in rows if bag in (row.bag, Path(row.bag).name)]
+    if not named:
+        raise SessionError(f'{bag} is no attempt in the index: `attempts` lists them')
+    return named[0]
+
+
+def curves_table(rows: Sequence[AttemptRow]) -> tuple[list[LearningCurve], Table]:
+    """Return the learning curves, and the end of each as a table."""
+    curves = learning_curves(rows, PASS_SCORE)
+    table = Table('subject', 'exercise', 'attempts', 'last', 'average of 5', 'holds pass line from')
+    for curve in curves:
+        table.add_row(
+            escape(curve.subject), escape(curve.exercise), str(len(curve.points)),
+            f'{curve.points[-1]:.1f}', f'{curve.average[-1]:.1f}',
+            str(curve.first_pass or 'not yet'),
+        )  # fmt: skip
+    return curves, table
+
+
+def export_rows(rows: Sequence[AttemptRow], file: Path) -> None:
+    """Write attempts with all measures, in SI units, as .csv or .parquet.
+
+    Raises:
+        SessionError: the name has another ending.
+    """
+    if file.suffix not in ('.csv', '.parquet'):
+        raise SessionError(f'{file}: end its name in .csv or .parquet')
+    heads = ('bag', 'subject', 'exercise', 'attempt', 'begun', 'state', 'points', 'passed', 'notes')
+    columns: dict[str, list[Any]] = {name: [plain(row)[name] for row in rows] for name in heads} | {
+        name: [row.measures.get(name) for row in rows] for name in MEASURES
+    }
+    if file.suffix == '.parquet':
+        numbers = {name: pa.array(columns[name], pa.float64()) for name in ('points', *MEASURES)}
+        pq.write_table(pa.table(columns | numbers), file)
+        return
+    with file.open('w', encoding='utf-8', newline='') as out:
+        writer = csv.writer(out, lineterminator='\n')
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+
+
+def delete(store: AttemptStore, folder: Path, subject: str) -> list[str]:
+    """Delete a subject: rows of the index, and the bags in the indexed folder.
+
+    Raises:
+        SessionError: the index has no attempt of that subject.
+    """
+    bags = store.delete_subject(subject)
+    if not bags:
+        raise SessionError(
+            f'the index has no attempt of {subject!r}: `attempts` lists the subjects'
+        )
+    own = [bag for bag in map(Path, bags) if bag.parent == folder.resolve() and bag.is_dir()]
+    for bag in own:
+        shutil.rmtree(bag)
+    return [str(bag) for bag in own]

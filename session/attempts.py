@@ -1,0 +1,67 @@
+"""Who makes an attempt, and which one it is: what a session writes into its bag."""
+
+import sqlite3
+from pathlib import Path
+
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.metadata import METADATA_FILE
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.exercises.attempt_store import AttemptStore, new_pseudonym
+from cutting_trainer.session.errors import SessionError
+
+STORE_FILE = 'attempts.sqlite'
+
+
+def open_store(folder: Path) -> AttemptStore:
+    """Return the index of a folder of bags.
+
+    Raises:
+        SessionError: its file is no index.
+    """
+    file = folder.resolve() / STORE_FILE
+    try:
+        return AttemptStore(file)
+    except sqlite3.DatabaseError:
+        raise SessionError(
+            f'{file} is no index of attempts: delete it, and it is made anew from the bags'
+        ) from None
+
+
+def attempt_data(folder: Path, exercise: str, subject: str, notes: str) -> dict[str, str]:
+    """Return what the bag of an attempt says about it.
+
+    Args:
+        folder: where the bag goes.
+        exercise: name of the scene.
+        subject: pseudonym; empty: a new one.
+        notes: remarks on the session.
+
+    Raises:
+        SessionError: the folder has a file in place of its index.
+    """
+    number = next_attempt(folder, subject, exercise) if subject else 1
+    return {'subject': subject or new_pseudonym(), 'attempt': str(number), 'notes': notes}
+
+
+def next_attempt(folder: Path, subject: str, exercise: str) -> int:
+    """Return the number of a subject's next attempt, by the index and the bags beside it.
+
+    Args:
+        folder: of the bags.
+        subject: pseudonym.
+        exercise: name of the scene.
+    """
+    store = open_store(folder)
+    known = store.bags()
+    last = store.next_attempt(subject, exercise) - 1
+    for metadata in folder.resolve().glob(f'*/{METADATA_FILE}'):
+        if str(metadata.parent) in known:
+            continue
+        try:
+            data = open_bag(metadata.parent).custom_data
+        except BagError:
+            continue  # `attempts` names it
+        if data.get('subject') == subject and Path(data.get('scene_file', '')).stem == exercise:
+            number = data.get('attempt', '')
+            last = max(last, int(number) if number.isdecimal() else 0)
+    return last + 1
