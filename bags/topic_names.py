@@ -4,12 +4,12 @@ from collections.abc import Collection
 
 MESH, UPDATES = '/tissue/mesh', '/tissue/mesh_updates'
 FORCE, INPUTS = '/tissue/force', '/tissue/frame_inputs'
-CONTACT = '/tool/contact'
+CONTACT, INDEXING = '/tool/contact', '/haptic_bridge/indexing'
 POSE, SERVO_CF = '/arm/measured_cp', '/arm/servo_cf'
 FORCES = (SERVO_CF, '/arm/body/servo_cf', '/arm/spatial/servo_cf')
 """Possible topics of the force on the hand: `device.force_topic` selects one."""
 OF_DEVICE = (POSE, '/arm/measured_cv', '/arm/measured_cf')
-BUTTON = '/arm/button'
+BUTTONS = ('/arm/button', '/arm/clutch')
 OF_TISSUE = (MESH, UPDATES, FORCE, CONTACT)
 STATE, MEMORY = '/tissue/state', '/cutting/state'
 CUTS = '/cutting/cut/_service_event'
