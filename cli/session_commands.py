@@ -127,6 +127,20 @@ def probe_device(
     moves: Annotated[
         bool, typer.Option(help='Ask for moves and a turn: unit, handedness, scale, orientation.')
     ] = True,
+    place: Annotated[
+        str,
+        typer.Option(
+            help='Scene file: ask for touches of known points, and write to its section device '
+            'where the device is. Its profile counts.'
+        ),
+    ] = '',
+    point: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='With --place: x,y,z of a point in the tissue [m]; give three or more (default: '
+            "the corners of the tissue's underside).",
+        ),
+    ] = None,
     push: Annotated[
         bool,
         typer.Option(
@@ -148,7 +162,10 @@ def probe_device(
     from cutting_trainer.session.probe_command import Emulation, ProbeOptions, run_probe
 
     emulation = Emulation(faults=faults) if emulated else None
+    points = tuple(point or ())
     options = ProbeOptions(
-        arm, profile, emulation, moves, push, parse_domain(domain), as_json, force_topic
+        *(arm, profile, emulation, moves, push, parse_domain(domain), as_json, force_topic),
+        place=place,
+        points=points,
     )
     raise typer.Exit(int(run_probe(options)))

@@ -13,12 +13,16 @@ import numpy as np
 from cutting_trainer.haptic_bridge.devices.probe_stream import extent
 
 MIN_POINTS = 3
-MAX_RESIDUAL_SHARE = 0.03
+MAX_RESIDUAL_SHARE = 0.015
 """Largest distance of a touch from its point, as a share of the extent of all points."""
 MAX_TREMOR_M = 0.002
 """[m] Extent of the tip's path, at the hand, while it is held still on a point."""
 MIN_SPREAD = 0.15
 """Smallest ratio of breadth to length of the points, as standard deviations."""
+HOLD_S = 1.5
+"""[s] for which the tip is held still on a point."""
+MIN_MOVE_M = 0.005
+"""[m] Shortest way, at the hand, from one point to the next."""
 LIFT_M = 0.05
 """[m] by which the tip is lifted."""
 _MIN_LIFT_M = 0.015
@@ -58,23 +62,35 @@ class Placement(NamedTuple):
         return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
 
 
-def still_point(positions: np.ndarray, metres: float, name: str) -> np.ndarray:
-    """Return the mean of the tip's positions on a point, in the unit sent, shape (3,).
+def find_touch(times: np.ndarray, positions: np.ndarray, metres: float) -> np.ndarray | None:
+    """Return where the tip rests after a move.
 
     Args:
-        positions: as sent, while the tip was held still, shape (n, 3).
+        times: [s], shape (n,).
+        positions: as sent, shape (n, 3).
         metres: one unit of the positions [m].
-        name: of the point.
 
-    Raises:
-        PlacementError: it was not still.
+    Returns:
+        The mean of its positions there, in the unit sent, shape (3,); None as long as it does not.
     """
-    moved = metres * extent(positions)
-    if moved > MAX_TREMOR_M:
-        raise PlacementError(
-            f'the tip moved by {1e3 * moved:.1f} mm on {name}: rest the hand, and hold it still'
+    if len(times) < 3 or times[-1] - times[0] < HOLD_S:
+        return None
+    last = positions[times >= times[-1] - HOLD_S]
+    if metres * extent(last) > MAX_TREMOR_M:
+        return None
+    found = np.asarray(last.mean(axis=0))
+    moved = metres * float(np.linalg.norm(found - positions[0]))
+    return found if moved >= MIN_MOVE_M else None
+
+
+def why_no_touch(positions: np.ndarray, metres: float, name: str) -> PlacementError:
+    """Return why a touch was not seen in the positions since it was asked for."""
+    if len(positions) and metres * extent(positions) > MIN_MOVE_M:
+        return PlacementError(
+            f'the tip was not held still on {name}: rest the hand, and hold it within '
+            f'{1e3 * MAX_TREMOR_M:g} mm for {HOLD_S:g} s'
         )
-    return np.asarray(positions.mean(axis=0))
+    return PlacementError(f'the tip was not moved to {name}')
 
 
 def place(touched: np.ndarray, points: np.ndarray, names: Sequence[str] = ()) -> Placement:
