@@ -172,10 +172,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     },
     './trainer run PROGRAM ...': Nowhere('PROGRAM stands for what others of these commands run'),
     './trainer probe-device --arm /MTML --profile dvrk_mtm': Nowhere('needs a real arm'),
-    './trainer probe-device --arm /MTML --place my_scene.yaml': Elsewhere(
-        'test_placement.py::test_an_emulated_device_is_placed_over_dds',
-        ('session/place_device.py',),
-    ),
+    './trainer probe-device --arm /MTML --place my_scene.yaml': Nowhere('needs a real arm'),
     './trainer bridge-side --no-arm --scene block --bag NEW': Nowhere('needs a real arm'),
     './trainer sim-side --scene block': Nowhere('the other half of a session with a real arm'),
     './trainer view --attach --scene block': Nowhere(
