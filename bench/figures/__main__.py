@@ -30,10 +30,9 @@ class Subject(NamedTuple):
 
 SUBJECTS = {
     'arms': Subject(
-        modules=('arms_two_tools', 'arms_clutch', 'arms_placement'),
+        modules=('arms_two_tools', 'arms_energy', 'arms_clutch', 'arms_placement'),
         not_covered={
-            1: 'of it: the energy account over both tools; 60 s take '
-            '`python -m bench.figures.arms_two_tools --seconds 60`',
+            1: 'of it: 60 s take `python -m bench.figures.arms_two_tools --seconds 60`',
             2: 'of it: a thousand take `python -m bench.figures.arms_clutch --rounds 40 --each 25`',
             3: 'foreign programs are not run here',
             5: 'it takes a quiet machine: `./trainer bench speed`',
