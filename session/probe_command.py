@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -79,6 +79,7 @@ class ProbeOptions:
         place: scene whose section `device` is to say where the device is; '': none.
         points: known points in that scene's tissue frame, as `x,y,z` [m]; (): the corners of its
             tissue's underside.
+        metres: one unit of the positions [m], by the scene.
     """
 
     arm: str = 'arm'
@@ -91,6 +92,7 @@ class ProbeOptions:
     force_topic: str = 'servo_cf'
     place: str = ''
     points: tuple[str, ...] = ()
+    metres: float = 1.0
 
 
 def run_probe(options: ProbeOptions) -> Status:
@@ -108,7 +110,7 @@ def run_probe(options: ProbeOptions) -> Status:
     if guide is None:
         profile = DeviceSettings.model_construct(profile=options.profile).load_profile()
     else:
-        profile = guide.profile
+        profile, options = guide.profile, replace(options, metres=guide.metres)
     with reserved_domain(options.domain) as domain:
         # Here, for the ROS of this process, before its libraries read it.
         os.environ.update(node_environment(domain))
@@ -156,7 +158,8 @@ def _checks(
     if poses is None:
         silent = f'{node.pose_topic} has a publisher that sends nothing: is the device on?'
         return [*checks, ProbeCheck('rate', 'wrong', 'silent', silent)]
-    checks += check_stream(poses, profile, node.pose_topic)
+    scaled = replace(poses, values=poses.values * [*[options.metres] * 3, 1.0, 1.0, 1.0, 1.0])
+    checks += check_stream(scaled, profile, node.pose_topic)
     if guide is not None:
         if options.emulation is not None:
             node.enable()
