@@ -1,12 +1,14 @@
 """Claims about the clutch and the live scale of motion: no jump, no force, and still safe."""
 
+from collections import deque
+
 import numpy as np
 import pytest
 from rig import PROFILE, QUIET, RADIUS, Rig
 from scipy.spatial.transform import Rotation
 
 from cutting_trainer.haptic_bridge.force_kernels import NONE, TOUCHING
-from cutting_trainer.haptic_bridge.force_path import ENERGY_CREDIT_J
+from cutting_trainer.haptic_bridge.force_path import ENERGY_CREDIT_J, ForcePath
 from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceSettings,
     HapticsSettings,
@@ -14,7 +16,10 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     ToolSettings,
     Transform,
 )
+from cutting_trainer.node_common.cdr_codec import ContactCodec, StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.recordings import what_if
+from cutting_trainer.viewer.tool_state import Translator
 
 FRAME = Transform(translation=(0.01, -0.02, 0.03), rotation_rpy_deg=(20, -35, 110), scale=1.4)
 DEPTH = 4e-3
@@ -25,8 +30,9 @@ class Hand:
 
     def __init__(self, haptics=QUIET, frame=FRAME):
         tool = ToolSettings(radius=RADIUS, coupling_stiffness=200.0, blade_facing=(1, 0, 0))
-        device = DeviceSettings(tissue_from_device=frame, force_frame='base')
-        self.rig = Rig(haptics=haptics, device=device, tool=tool)
+        self.device = DeviceSettings(tissue_from_device=frame)
+        self.rig = Rig(haptics=haptics, device=self.device, tool=tool)
+        self.poses = []
         self.frame = frame
         self.place, self.turn = np.array([0.0, 0.0, RADIUS + 1e-3]), Rotation.identity()
         self.work = 0.0
@@ -48,7 +54,9 @@ class Hand:
         if self.at is not None:
             self.work += self.rig.forces[-1] @ (position - self.at)
         self.at = position
-        self.rig.tick(tuple(position), Rotation.from_matrix(rotation).as_quat())
+        quaternion = Rotation.from_matrix(rotation).as_quat()
+        self.rig.tick(tuple(position), quaternion)
+        self.poses.append(StampedMessage(self.rig.now, '', (*position, *quaternion)))
         self.felt.append(np.linalg.norm(self.rig.forces[-1]))
         self.tips.append(self.rig.contact('device'))
         self.blades.append(
@@ -213,6 +221,55 @@ def made(haptics):
 def test_pumping_by_the_clutch_makes_no_energy():
     assert made(HapticsSettings(soft_start=0.1)) < 5 * ENERGY_CREDIT_J
     assert made(HapticsSettings(soft_start=0.1, max_damping=0.0)) > 25 * ENERGY_CREDIT_J
+
+
+@pytest.mark.parametrize('after', [0, 250])
+def test_recorded_changes_put_the_tool_where_it_was_from_the_middle_too(after):
+    hand = Hand()
+    coupling = hand.rig.path.coupling
+    changes, poses = [coupling.indexing], []
+    hand.press()
+    for target, order in (
+        ((0.02, 0.01, 0.03), {'clutched': True}),
+        ((0.0, 0.01, 0.02), {'clutched': False}),
+        ((0.01, -0.01, 0.03), {'motion_scale': 0.9}),
+        ((0.0, -0.01, 0.03), {'clutched': True, 'motion_scale': 1.1}),
+        ((0.0, 0.0, 0.02), {'clutched': False}),
+    ):
+        coupling.change(**order)
+        turn = Rotation.from_rotvec(10 * np.array(target)) * hand.turn
+        hand.go(target, turn, ms=60)
+    changes += coupling.unsent
+    assert len(changes) == 6
+    again = what_if.Hand(
+        ForcePath(hand.rig.tool, hand.device, QUIET, PROFILE), indexings=deque(changes)
+    )
+    poses = hand.poses[400 + after :]
+    for pose, tip, blade in zip(
+        poses, hand.tips[400 + after :], hand.blades[400 + after :], strict=True
+    ):
+        again.tick(pose)
+        values = again.contact.values
+        fields = ContactCodec.fields
+        np.testing.assert_allclose(values[fields['device']], tip, atol=1e-12)
+        found = [*values[fields['blade_root']], *values[fields['blade_facing']]]
+        np.testing.assert_allclose(found, blade, atol=1e-12)
+
+
+def test_the_page_draws_the_tool_as_it_is_turned():
+    hand = Hand()
+    hand.press()
+    hand.clutch(True)
+    hand.go((0.02, 0.01, 0.03), Rotation.from_rotvec((0.7, -0.4, 1.1)), ms=100)
+    for clutched in (True, False):
+        hand.clutch(clutched)
+        hand.go(hand.place, ms=2)
+        contact = StampedMessage(1, '', hand.rig.ticks[-1].contact)
+        indexing = hand.rig.path.coupling.indexing
+        moment = Translator(hand.device).moment(contact, hand.poses[-1], None, indexing)
+        w, *axis = moment.orientation
+        drawn = Rotation.from_quat([*axis, w]).apply(hand.rig.tool.blade_root)
+        np.testing.assert_allclose(moment.tip + drawn, moment.blade[0], atol=1e-9)
 
 
 def test_a_clutch_before_the_first_pose_waits_for_it():
