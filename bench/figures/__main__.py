@@ -30,7 +30,8 @@ class Subject(NamedTuple):
 
 SUBJECTS = {
     'arms': Subject(
-        modules=('arms_two_tools', 'arms_energy', 'arms_clutch', 'arms_placement'),
+        modules=('arms_two_tools',),
+        together=('arms_energy', 'arms_clutch', 'arms_placement'),
         not_covered={
             1: 'of it: 60 s take `python -m bench.figures.arms_two_tools --seconds 60`',
             2: 'of it: a thousand take `python -m bench.figures.arms_clutch --rounds 40 --each 25`',
