@@ -14,7 +14,14 @@ import numpy as np
 
 from cutting_trainer.bags.message_order import Sequence
 from cutting_trainer.bags.reader import Bag, Recorded
-from cutting_trainer.bags.recorded_frames import FrameRecord, Restart, Segment, read_run, runs
+from cutting_trainer.bags.recorded_frames import (
+    FrameRecord,
+    Restart,
+    Segment,
+    ToolRecord,
+    read_run,
+    runs,
+)
 from cutting_trainer.bags.resimulation import (
     LACKS_MEMORY,
     Resimulation,
@@ -28,8 +35,8 @@ from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica, state_hash
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
-PoseError = Callable[[StampedMessage, Any, int], float]
-"""Returns the distance [m] of the tool of a contact from the place that a device pose gives,
+PoseError = Callable[[ToolRecord, int], float]
+"""Returns the distance [m] of the tool of a contact from the place that its device pose gives,
 for the number of the tool."""
 MAX_ROUNDING = 1e-9
 """Largest relative difference that counts as rounding. A difference that matters grows beyond it:
@@ -249,7 +256,7 @@ def _check_record(
             comparison.missing['poses of the device'] += 1
         elif tool.pose is not None:
             comparison.poses += 1
-            if distance := pose_error(tool.pose, tool.contact, number):
+            if distance := pose_error(tool, number):
                 text = f'the pose of the device puts the tool {distance:.3g} m from its contact'
                 raise _Differs(text, distance)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import Bag, Recorded
-from cutting_trainer.bags.topic_names import BUTTON, MESH, POSE, UPDATES, of_session
+from cutting_trainer.bags.topic_names import BUTTONS, MESH, POSE, UPDATES, of_session
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, StampedMessage
 
 _BATCH, _BATCHES = 500, 4
@@ -117,16 +117,17 @@ class RecordedHand:
             raise BagError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
         self._times = np.array([(m.log_time - origin) * 1e-9 for m in recorded])
         self._poses = [codec.decode(m.data) for m in recorded]
-        events = list(bag.messages([of_session(BUTTON, bag.topics())]))
+        names = {of_session(topic, bag.topics()): topic for topic in BUTTONS}
+        events = list(bag.messages(names))
         self._event_times = np.array([(m.log_time - origin) * 1e-9 for m in events])
-        self._events = [m.data for m in events]
+        self._events = [(names[m.topic], m.data) for m in events]
 
     def pose(self, position: float) -> StampedMessage:
         """Return the newest pose at a position [s], the first one before it."""
         at = int(np.searchsorted(self._times, position, 'right')) - 1
         return self._poses[max(at, 0)]
 
-    def events(self, before: int, position: float) -> tuple[list[bytes], int]:
+    def events(self, before: int, position: float) -> tuple[list[tuple[str, bytes]], int]:
         """Return the button events on the path to a position.
 
         Args:
@@ -134,7 +135,7 @@ class RecordedHand:
             position: [s].
 
         Returns:
-            The messages as they were recorded, and the number of events done by then.
+            The topics and messages as they were recorded, and the number of events done by then.
         """
         done = int(np.searchsorted(self._event_times, position, 'right'))
         return self._events[before if done >= before else max(done - 1, 0) : done], done

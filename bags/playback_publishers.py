@@ -19,10 +19,11 @@ from cutting_trainer.bags.playback_messages import RecordedHand, RecordedStream
 from cutting_trainer.bags.qos_adaptation import publisher_qos
 from cutting_trainer.bags.reader import Bag
 from cutting_trainer.bags.topic_names import (
-    BUTTON,
+    BUTTONS,
     CONTACT,
     FORCE,
     FORCES,
+    INDEXING,
     MESH,
     OF_DEVICE,
     OF_TISSUE,
@@ -165,7 +166,9 @@ class SessionPlayer(Player):
     ) -> None:
         super().__init__(context, playhead)
         self._bag, self._start = bag, start
-        wanted = (*OF_TISSUE, *FORCES) if drive_device else (*OF_TISSUE, *OF_DEVICE, BUTTON)
+        wanted = (
+            (*OF_TISSUE, *FORCES) if drive_device else (*OF_TISSUE, INDEXING, *OF_DEVICE, *BUTTONS)
+        )
         self.topics = [topic for topic in wanted if topic in bag.topics()]
         self._wrench = WrenchStampedCodec('arm_base')
         self._grown: dict[str, StampedCodec] = {}
@@ -237,8 +240,10 @@ class HandPlayer(Player):
     def advertise(self) -> None:
         """Create the publishers."""
         self._poses = self.create_publisher(PoseStamped, f'{REPLAYED}{POSE}', STREAM)
-        self._button = self.create_publisher(Joy, f'{REPLAYED}{BUTTON}', EVENTS)
-        self._watched = [f'{REPLAYED}{POSE}', f'{REPLAYED}{BUTTON}']
+        self._buttons = {
+            topic: self.create_publisher(Joy, f'{REPLAYED}{topic}', EVENTS) for topic in BUTTONS
+        }
+        self._watched = [f'{REPLAYED}{topic}' for topic in (POSE, *BUTTONS)]
         # The bridge commands no force without a device that takes it.
         self._forces = [
             polled(self, WrenchStamped, f'{REPLAYED}{force}', NEWEST_BEST_EFFORT)
@@ -253,10 +258,13 @@ class HandPlayer(Player):
         self._poses.publish(self._codec.encode(time.time_ns(), values))
         events, done = self._hand.events(self._events, position)
         # A bridge that is not enabled may not listen yet: an event would be lost.
-        if done != self._events and (self._begun or self._button.get_subscription_count()):
+        if done != self._events and (self._begun or self._is_heard(BUTTONS[0])):
             self._events = done
-            for data in events:
-                self._button.publish(data)
+            for topic, data in events:
+                self._buttons[topic].publish(data)
+
+    def _is_heard(self, topic: str) -> bool:
+        return bool(self._buttons[topic].get_subscription_count())
 
     def watch(self, now: float) -> None:
         """Stop for a bridge that is not enabled; it may have been so too briefly to be seen."""

@@ -11,6 +11,7 @@ import numpy as np
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.message_order import Sequence
 from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.recorded_indexings import indexing_at, recorded_indexings
 from cutting_trainer.bags.recorded_tissue import first_current_keyframe
 from cutting_trainer.bags.topic_names import (
     CONTACT,
@@ -21,6 +22,7 @@ from cutting_trainer.bags.topic_names import (
     further_tools,
     of_session,
 )
+from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
     ForceSampleCodec,
@@ -43,12 +45,14 @@ class ToolRecord:
         contact: its message, None where the bag lacks it.
         pose: the device pose of that contact, None where the bag lacks it.
         force: `ForceSample` of the frame, None where the bag lacks it.
+        indexing: how the hand moved the tool at that pose; None: as the scene says.
     """
 
     has_contact: bool
     contact: Any
     pose: StampedMessage | None
     force: StampedMessage | None
+    indexing: Indexing | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,7 @@ class FrameRecord:
         diverged: the frame was taken back.
         force: `ForceSample` of the frame, None where the bag lacks it.
         others: contacts of the further tools, by number; None where the bag lacks their inputs.
+        indexing: as of a `ToolRecord`, of the first tool.
     """
 
     step: int
@@ -81,11 +86,12 @@ class FrameRecord:
     diverged: bool
     force: StampedMessage | None
     others: tuple[ToolRecord | None, ...] = ()
+    indexing: Indexing | None = None
 
     @property
     def by_tool(self) -> tuple[ToolRecord | None, ...]:
         """The contact of each tool."""
-        first = ToolRecord(self.has_contact, self.contact, self.pose, self.force)
+        first = ToolRecord(self.has_contact, self.contact, self.pose, self.force, self.indexing)
         return (first, *self.others)
 
 
@@ -249,6 +255,7 @@ def _tool_records(bag: Bag, inputs: list[Any], tool: str) -> dict[int, ToolRecor
     poses = _samples(bag, pose, PoseStampedCodec(), lambda s: s.stamp_ns, wanted)
     stamps = {nanoseconds(m.header.stamp) for m in inputs}
     forces = _samples(bag, f'{tool}{FORCE}', ForceSampleCodec(), lambda s: s.stamp_ns, stamps)
+    indexings = recorded_indexings(bag, tool)
     found = {}
     for m in inputs:
         stamp = nanoseconds(m.contact_stamp)
@@ -258,6 +265,7 @@ def _tool_records(bag: Bag, inputs: list[Any], tool: str) -> dict[int, ToolRecor
             contact=None if contact is None else contact_message(contact),
             pose=poses.get(stamp) if m.has_contact else None,
             force=forces.get(nanoseconds(m.header.stamp)),
+            indexing=indexing_at(indexings, stamp) if m.has_contact else None,
         )
     return found
 

@@ -1,5 +1,6 @@
 """Commands on a running graph: a session, the page, the recorder, a device."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -67,6 +68,16 @@ def view(
     attach: Annotated[
         bool, typer.Option('--attach', help='Show the graph that runs already; start no session.')
     ] = False,
+    arm: Annotated[
+        str,
+        typer.Option(
+            help='Namespace of a device whose driver runs, as in /MTML: it is checked, and takes '
+            'the place of the emulated arm.'
+        ),
+    ] = '',
+    records: Annotated[
+        bool, typer.Option('--record', help='Record from the start, into bags/sessions.')
+    ] = False,
     bag: Annotated[
         Path | None,
         typer.Option(help='Folder of a bag: show that, with a time line, instead of a session.'),
@@ -94,10 +105,26 @@ def view(
         raise typer.Exit(int(status))
     if resimulate or changes:
         raise SessionError('--resimulate and --with are for a recorded session: give its --bag')
+    if records and attach:
+        raise SessionError('--record is for a session of its own: ./trainer record records others')
     options = ViewOptions(
-        scene, host, port, attach, seed, parse_domain(domain), tuple(allow_host or ())
+        *(scene, host, port, attach, seed, parse_domain(domain), tuple(allow_host or ())),
+        arm=namespace(arm),
+        record=records,
     )
     raise typer.Exit(int(run_view(options)))
+
+
+def namespace(arm: str) -> str:
+    """Return the namespace of a device with one slash before it; '': none was given.
+
+    Raises:
+        SessionError: it is not a name of ROS.
+    """
+    words = arm.strip('/')
+    if words and not re.fullmatch(r'[A-Za-z_]\w*(/[A-Za-z_]\w*)*', words, re.ASCII):
+        raise SessionError(f'--arm {arm}: give a namespace of ROS, as in /MTML')
+    return f'/{words}' if words else ''
 
 
 @commands.command(epilog=EXIT_STATUSES)
@@ -133,6 +160,20 @@ def probe_device(
     moves: Annotated[
         bool, typer.Option(help='Ask for moves and a turn: unit, handedness, scale, orientation.')
     ] = True,
+    place: Annotated[
+        str,
+        typer.Option(
+            help='Scene file: ask for touches of known points, and write to its section device '
+            'where the device is. Its profile counts.'
+        ),
+    ] = '',
+    point: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='With --place: x,y,z of a point in the tissue [m]; give three or more (default: '
+            "the corners of the tissue's underside).",
+        ),
+    ] = None,
     push: Annotated[
         bool,
         typer.Option(
@@ -154,7 +195,10 @@ def probe_device(
     from cutting_trainer.session.probe_command import Emulation, ProbeOptions, run_probe
 
     emulation = Emulation(faults=faults) if emulated else None
+    points = tuple(point or ())
     options = ProbeOptions(
-        arm, profile, emulation, moves, push, parse_domain(domain), as_json, force_topic
+        *(arm, profile, emulation, moves, push, parse_domain(domain), as_json, force_topic),
+        place=place,
+        points=points,
     )
     raise typer.Exit(int(run_probe(options)))

@@ -22,7 +22,7 @@ from cutting_trainer.node_common.parameters import (
     seed_parameter,
 )
 from cutting_trainer.node_common.rejections import MessageError, require_frame, require_tool
-from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.stamps import REVISION_MODULUS
 from cutting_trainer.node_common.timing import FRAME_NICENESS, request_preference
 from cutting_trainer.tissue_sim.contact.blade import Sweep
@@ -62,6 +62,7 @@ class CuttingNode(ManagedNode):
         scene = Path(scene_parameter(self))
         seed_parameter(self)
         self._settings = read_section(scene, 'cutting', CuttingSettings)
+        self._tools = 1 + len(tool_names(scene))
         warm_up(self._settings)
         self._method = make_method(self._settings)
         most = max_nodes_parameter(self)
@@ -233,7 +234,7 @@ class CuttingNode(ManagedNode):
         if self._mesh is None:
             return (Cut.Response.NOT_READY, 'no mesh has come yet on tissue/mesh'), None
         try:
-            require_tool('Cut', request.tool)
+            require_tool('Cut', request.tool, count=self._tools)
         except MessageError as error:
             return (Cut.Response.INVALID_SWEEP, str(error)), None
         if request.command == Cut.Request.ABORT:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, safety
+from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.proxy import friction
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import spring_force, surface_stiffness
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
@@ -37,6 +38,8 @@ SETUP = record_type(
         ('rotation', 'f8', (3, 3)),  # device frame to tissue frame
         ('translation', 'f8', (3,)),  # [m]
         ('scale', 'f8'),
+        ('alignment', 'f8', (4,)),  # x y z w, from the tool to the device's tip
+        ('clutched', 'b1'),  # the tool stays where translation and alignment put it
         ('force_scale', 'f8'),
         ('blade', 'f8', (2, 3)),  # root and tip [m], tool frame
         ('facing', 'f8', (3,)),  # of its edge, tool frame; zero: all round
@@ -94,13 +97,20 @@ def make_setup(
     haptics: HapticsSettings,
     profile: DeviceProfile,
     steps: Steps = NO_STEPS,
+    indexing: Indexing | None = None,
 ) -> np.ndarray:
-    """Return the constants of a session for the kernels: dtype SETUP, shape (1,)."""
+    """Return the constants of a session for the kernels: dtype SETUP, shape (1,).
+
+    Args:
+        tool, device, haptics: sections of the scene.
+        profile: limits of the device.
+        steps: in which a crack runs before the blade.
+        indexing: how the hand moves the tool, with the scale of `device`; None: as the scene says.
+    """
     frame = device.tissue_from_device
     setup = np.zeros(1, SETUP)
     setup['rotation'] = frame.rotation()
-    setup['translation'] = frame.translation
-    setup['scale'] = frame.scale
+    (indexing or Indexing.of(frame)).write(setup)
     setup['force_scale'] = haptics.force_scale
     setup['blade'] = (tool.blade_root, tool.blade_tip)
     setup['facing'] = tool.facing()
@@ -139,6 +149,15 @@ def _rotate(q: np.ndarray, v: np.ndarray, sign: float, out: np.ndarray) -> None:
 
 
 @inner
+def _multiply(p: np.ndarray, q: np.ndarray, out: np.ndarray) -> None:
+    """Multiply two quaternions (x y z w), shape (4,): q turns first."""
+    out[0] = p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1]
+    out[1] = p[3] * q[1] - p[0] * q[2] + p[1] * q[3] + p[2] * q[0]
+    out[2] = p[3] * q[2] + p[0] * q[1] - p[1] * q[0] + p[2] * q[3]
+    out[3] = p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2]
+
+
+@inner
 def _add_turn(before: np.ndarray, after: np.ndarray, turned: np.ndarray) -> None:
     """Add the rotation vector [rad] between two quaternions (x y z w), in their base frame."""
     a, b = after, before
@@ -168,20 +187,25 @@ def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
     _add_turn(s.orientation, values[3:], s.turned)
     for k in range(4):
         s.orientation[k] = values[3 + k]
-    arm = np.empty(3)
+    arm, turn = np.empty(3), np.empty(4)
     for k in range(3):
         s.tip[k] = c.translation[k]
-        for j in range(3):
-            s.tip[k] += c.scale * c.rotation[k, j] * values[j]
+        if not c.clutched:
+            for j in range(3):
+                s.tip[k] += c.scale * c.rotation[k, j] * values[j]
+    if c.clutched:
+        turn[:] = c.alignment
+    else:
+        _multiply(s.orientation, c.alignment, turn)
     for end in range(2):
-        _rotate(s.orientation, c.blade[end], 1.0, arm)
+        _rotate(turn, c.blade[end], 1.0, arm)
         for k in range(3):
             s.blade[end, k] = s.tip[k]
             s.arms[end, k] = 0.0
             for j in range(3):
                 s.blade[end, k] += c.rotation[k, j] * arm[j]
                 s.arms[end, k] += c.rotation[k, j] * arm[j]
-    _rotate(s.orientation, c.facing, 1.0, arm)
+    _rotate(turn, c.facing, 1.0, arm)
     size = 0.0
     for k in range(3):
         s.facing[k] = 0.0
@@ -350,9 +374,10 @@ def command(
         for j in range(3):
             wanted[k] += c.force_scale * c.rotation[j, k] * felt[j]
             wanted[3 + k] += lever * c.rotation[j, k] * torque[j]
-    safety.state_gate(enabled, wanted)
+    felt_by_hand = enabled and not c.clutched
+    safety.state_gate(felt_by_hand, wanted)
     s.damping = 0.0
-    if enabled and contact != NONE:
+    if felt_by_hand and contact != NONE:
         s.damping = safety.control(
             s.energy, s.velocity, _PASSIVITY_RECOVERY_S, c.max_damping, wanted
         )

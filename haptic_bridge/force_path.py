@@ -17,6 +17,7 @@ from cutting_trainer.haptic_bridge.contact_plausibility import MAX_STEP_AHEAD, C
 from cutting_trainer.haptic_bridge.contact_values import ContactReport, Tick
 from cutting_trainer.haptic_bridge.devices.motion_gate import MotionGate
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.hand_coupling import HandCoupling
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import surface_stiffness
 from cutting_trainer.haptic_bridge.proxy.friction import make_proxy, split_stiffness
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
@@ -26,7 +27,6 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceSettings,
     HapticsSettings,
     ToolSettings,
-    check_together,
 )
 from cutting_trainer.haptic_bridge.tissue_sample import TissueSample
 from cutting_trainer.node_common.cdr_codec import StampedMessage
@@ -75,6 +75,7 @@ class ForcePath:
         max_force: largest norm commanded [N].
         mode: of the tool, as it is reported.
         next_mode: mode that it takes once no blade is in the tissue.
+        coupling: of hand and tool, which may be changed.
 
     Raises:
         SettingsError: the settings do not fit together.
@@ -92,16 +93,12 @@ class ForcePath:
         steps: Steps = NO_STEPS,
         number: int = 0,
     ) -> None:
-        check_together(tool, device, haptics, profile)
-        self.haptics = haptics
-        self._tool, self._device, self._profile = tool, device, profile
         self.stale_trips = 0
         self.rejections = rejections or RejectionStatistics()
         self.contact_time = 0.0
         self.max_force = 0.0
         self.mode = self.next_mode = ToolMode[tool.mode.upper()]
-        self._steps = steps
-        self._setup = force_kernels.make_setup(tool, device, haptics, profile, steps)
+        self.coupling = HandCoupling(tool, device, haptics, profile, steps)
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
         names = ('force', 'wrench', 'tip', 'blade', 'arms')
@@ -117,7 +114,7 @@ class ForcePath:
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._grips = friction.sliding > 0.0
         self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
-        self._coupling = tool.coupling_stiffness
+        self._stiffness = tool.coupling_stiffness
         self._number = number
         self._report = ContactReport(self._state, tool.coupling_stiffness, tool.radius, number)
         self._pose = np.zeros(7)
@@ -133,27 +130,10 @@ class ForcePath:
         self._contact = NONE
         self._was_enabled = self._stale = False
 
-    def scale_force(self, force_scale: float) -> None:
-        """Change the scale of the hand's force; the slew limit makes the change gradual.
-
-        Args:
-            force_scale: hand force over tissue force.
-
-        Raises:
-            SettingsError: the coupling would be stiffer than the device bears.
-            ValidationError: the scale is out of range.
-        """
-        self.haptics = self.check_scale(force_scale)
-        self._setup = force_kernels.make_setup(
-            self._tool, self._device, self.haptics, self._profile, self._steps
-        )
-
-    def check_scale(self, force_scale: float) -> HapticsSettings:
-        """Return the settings with another scale, or raise as `scale_force`; nothing changes."""
-        values = self.haptics.model_dump() | {'force_scale': force_scale}
-        haptics = HapticsSettings.model_validate(values)
-        check_together(self._tool, self._device, haptics, self._profile)
-        return haptics
+    @property
+    def haptics(self) -> HapticsSettings:
+        """Return the section of the scene with the present scale of the force."""
+        return self.coupling.haptics
 
     @property
     def force_norm(self) -> float:
@@ -224,6 +204,9 @@ class ForcePath:
         )
         self._last_ns = now_ns
         enabled = state is CrtkState.ENABLED
+        if self.coupling.ordered and self._pose_stamp:
+            regained = self.coupling.carry_out(self._state, self._pose_stamp)
+            self._start_ns = now_ns if regained else self._start_ns
         fault = self._take_pose(now_ns, pose, enabled) or self._take_sample(
             now_ns, sample, now_ns if sample_ns is None else sample_ns, surface
         )
@@ -240,7 +223,7 @@ class ForcePath:
         if fault or state is CrtkState.FAULT:
             self._s['force'] = self._s['torque'] = 0.0
         if not force_kernels.command(
-            self._setup,
+            self.coupling.setup,
             self._state,
             self._history,
             self._contact,
@@ -273,7 +256,7 @@ class ForcePath:
         if code != safety.OK:
             self.rejections.add(POSE, MessageError(safety.POSE_FAULTS[code]))
             return safety.POSE_FAULTS[code]
-        force_kernels.to_tissue(self._setup, self._state, self._pose)
+        force_kernels.to_tissue(self.coupling.setup, self._state, self._pose)
         if not known:
             self._s['moved'] = self._s['turned'] = 0.0
         self._pose_stamp, self._pose_ns = pose.stamp_ns, now_ns
@@ -319,9 +302,9 @@ class ForcePath:
         self._s['advanced'] = 0.0
         if reaction.state == INSIDE:
             held = max(math.hypot(*reaction.force), math.hypot(*reaction.torque) / self._length)
-            self._s['held'] = min(self._s['held'], held + float(self._setup['slack'][0]))
+            self._s['held'] = min(self._s['held'], held + float(self.coupling.setup['slack'][0]))
         elif reaction.stiffness.any():
-            reported = surface_stiffness(reaction.stiffness, self._coupling)
+            reported = surface_stiffness(reaction.stiffness, self._stiffness)
             self._plausibility.update_stiffness(self._state, now_ns, reported)
         answered = self._began <= reaction.sequence <= self._sequence and self._contact == TOUCHING
         if reaction.state == INSIDE or answered:
@@ -391,7 +374,7 @@ class ForcePath:
                 self._proxy.reset()
                 self._undented.release()
                 before_cut = self.force_norm / self.haptics.force_scale
-                self._s['held'] = before_cut + self._setup['slack'][0]
+                self._s['held'] = before_cut + self.coupling.setup['slack'][0]
             self._contact = INSIDE
             assert surface is not None
             self._s['reach'] = self._plausibility.reach(surface, self._blade)

@@ -15,11 +15,13 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.parameter import Parameter
 
+from cutting_trainer.haptic_bridge.device_button import DeviceButton
 from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
 from cutting_trainer.haptic_bridge.devices.probe_graph import Wiring
 from cutting_trainer.haptic_bridge.e_stop_topic import EStop, Listener
 from cutting_trainer.haptic_bridge.force_path import ForcePath
-from cutting_trainer.haptic_bridge.mode_button import ModeButton
+from cutting_trainer.haptic_bridge.indexing import scaled
+from cutting_trainer.haptic_bridge.indexing_topic import IndexingTopic
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.haptic_bridge.simulation_follower import SimulationFollower
 from cutting_trainer.haptic_bridge.warm_up import warm_up
@@ -68,6 +70,10 @@ CLOCK_STEP_NS = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
 
+BUTTON, CLUTCH = 'button', 'clutch'
+"""Topics of buttons below `arm`."""
+SETTABLE = ('force_scale', 'motion_scale', 'tool_mode')
+"""Parameters that may change while the node runs."""
 MODES = {mode.name.lower(): mode for mode in ToolMode}
 """Modes of the tool by the names that a scene and the parameter give them."""
 
@@ -82,6 +88,7 @@ class HapticBridge(ManagedNode):
             Never again after that: a FAULT is left by a command only. Never after an E-STOP.
         e_stop_pressed: E-STOP is pressed from the start, as it was when this node died.
         force_scale: hand force over tissue force; may be set while the node runs.
+        motion_scale: tool motion over hand motion; may be set while the node runs.
         tool_mode: one of `MODES`; may be set while the node runs. A blade in the tissue stays one
             until it is out.
         accepted_publishers: see `accepted_publishers`.
@@ -106,6 +113,10 @@ class HapticBridge(ManagedNode):
         tool = read_section(scene, 'tool', ToolSettings, name)
         haptics = read_section(scene, 'haptics', HapticsSettings, name)
         profile = device.load_profile()
+        text = 'hand force over tissue force [-], above 0 to 100'
+        felt = parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
+        text, scale = 'tool motion over hand motion [-], above 0 to 100', device.tissue_from_device
+        device = scaled(device, parameter(self, 'motion_scale', scale.scale, text, settable=True))
         resistance, friction, steps = of_tissue(scene)
         warm_up(tool, device, haptics, profile, friction)
         self._path = ForcePath(
@@ -119,6 +130,7 @@ class HapticBridge(ManagedNode):
             steps,
             names.index(name),
         )
+        self._path.coupling.change(force_scale=felt)
         self._machine.start_anew()
         self._auto_enable = AutoEnable(self._machine, wanted=wanted)
         self._convention = DeviceConvention(device)
@@ -135,6 +147,7 @@ class HapticBridge(ManagedNode):
             WrenchStamped, f'{ros.ARM}/{device.force_topic}', qos.STREAM
         )
         self._contact = self.create_publisher(Contact, ros.CONTACT, qos.STREAM)
+        self._indexing = IndexingTopic(self, self._path.coupling)
         self._senders = PublisherMonitor(self, WATCHED, accepted_publishers(self, device))
         self._follower = SimulationFollower(self, self._machine.fault)
         self._interface = StateInterface(self, 'haptic_bridge', self._machine)
@@ -148,14 +161,14 @@ class HapticBridge(ManagedNode):
             'haptic_bridge/state_command': types.command,
         }
         self._wiring, self._wiring_due = Wiring(self, self._wrench, understood), 0.0
-        text = 'hand force over tissue force [-], above 0 to 100'
-        parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
         text = f'what the tool is: {" or ".join(MODES)}; used once no blade is in the tissue'
         mode = parameter(self, 'tool_mode', tool.mode, text, settable=True)
         self._path.next_mode = mode_of(mode)
         self._mode_button = None
         if device.mode_button is not None:
-            self._mode_button = ModeButton(self, device.mode_button, self._change_mode)
+            self._mode_button = DeviceButton(self, BUTTON, device.mode_button, self._change_mode)
+        clutch = (CLUTCH, 0) if device.clutch_button is None else (BUTTON, device.clutch_button)
+        self._clutch = DeviceButton(self, *clutch, self._change_clutch)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
         self._epoch = time.time_ns() - time.monotonic_ns()
@@ -187,6 +200,7 @@ class HapticBridge(ManagedNode):
             now = time.monotonic()
             if now >= due or self._follower.mesh_is_due:
                 self._follower.follow_mesh()
+            self._indexing.publish_changes()
             if now >= due:
                 due = now + STATE_POLL_PERIOD_S
                 try:
@@ -227,14 +241,14 @@ class HapticBridge(ManagedNode):
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Reject a request with any invalid parameter: all of it is used, or nothing."""
         for given in parameters:
-            if given.name not in ('force_scale', 'tool_mode'):
+            if given.name not in SETTABLE:
                 reason = f'{given.name} is read only at the start of the node'
                 return SetParametersResult(successful=False, reason=reason)
             try:
                 if given.name == 'tool_mode':
                     mode_of(given.value)
                 else:
-                    self._path.check_scale(given.value)
+                    self._path.coupling.check(**{given.name: given.value})
             except ValueError as error:
                 reason = ' '.join(str(error).split())
                 return SetParametersResult(successful=False, reason=reason)
@@ -242,15 +256,20 @@ class HapticBridge(ManagedNode):
 
     def _use_parameters(self, parameters: list[Parameter]) -> None:
         for given in parameters:
-            if given.name == 'force_scale':
-                self._path.scale_force(given.value)
-            elif given.name == 'tool_mode':
+            if given.name == 'tool_mode':
                 self._path.next_mode = mode_of(given.value)
+            elif given.name in SETTABLE:
+                self._path.coupling.change(**{given.name: given.value})
 
-    def _change_mode(self) -> None:
+    def _change_mode(self, pressed: bool) -> None:
         """Make a palpator of the scalpel, or close the jaws of a grasper, and back."""
-        mode = self._path.next_mode.other.name.lower()
-        self.set_parameters([Parameter('tool_mode', value=mode)])
+        if pressed:
+            mode = self._path.next_mode.other.name.lower()
+            self.set_parameters([Parameter('tool_mode', value=mode)])
+
+    def _change_clutch(self, pressed: bool) -> None:
+        """Take the hand off the tool while the button is pressed."""
+        self._path.coupling.change(clutched=pressed)
 
     def _cause(self) -> str:
         now = time.monotonic_ns()
@@ -362,6 +381,8 @@ class HapticBridge(ManagedNode):
             'simulation_age': path.simulation_age(now),
             'stale_trips': path.stale_trips,
             'force_scale': path.haptics.force_scale,
+            'motion_scale': path.coupling.indexing.scale,
+            'clutched': path.coupling.indexing.clutched,
             'energy': path.energy,
             'damping': path.damping,
             'revision': surface.revision if surface is not None else -1,

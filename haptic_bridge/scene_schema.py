@@ -130,6 +130,13 @@ class DeviceSettings(SceneModel):
         description='index into buttons of arm/button that makes a palpator of the scalpel, or '
         'closes the jaws of a grasper, or back',
     )
+    clutch_button: int | None = Field(
+        None,
+        ge=0,
+        le=31,
+        description='index into buttons of arm/button that takes the hand off the tool while it is '
+        'pressed; without it, buttons[0] of arm/clutch does',
+    )
     accepted_publishers: tuple[str, ...] = Field(
         (),
         max_length=32,

@@ -92,19 +92,21 @@ def require_frame(topic: str, frame: str) -> None:
         raise MessageError('wrong frame', text)
 
 
-def require_tool(name: str, tool: float, own: int | None = None) -> None:
-    """Raise if a message is about a tool that no scene has, or about another than its topic's.
+def require_tool(name: str, tool: float, own: int | None = None, count: int = MAX_TOOLS) -> None:
+    """Raise if a message is about a tool that the scene lacks, or about another than its topic's.
 
     Args:
         name: of the message.
         tool: number in it.
         own: number of the tool that the topic belongs to; None: any.
+        count: number of tools of the scene, where it is known.
 
     Raises:
         MessageError: the reason and the number.
     """
-    if tool >= MAX_TOOLS:
-        text = f'tool {tool:g} of {name}: a scene has {MAX_TOOLS} at most, from 0'
+    if tool >= count:
+        has = f'a scene has {count} at most' if count == MAX_TOOLS else f'the scene has {count}'
+        text = f'tool {tool:g} of {name}: {has}, from 0'
         raise MessageError('no such tool', text)
     if own is not None and tool != own:
         raise MessageError('no such tool', f'tool {tool:g} of {name}: its topic is of tool {own}')

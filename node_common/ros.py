@@ -30,6 +30,7 @@ PIECES = 'tissue/pieces'
 TISSUE_STATE = 'tissue/state'
 CUTTING_STATE = 'cutting/state'
 CONTACT = 'tool/contact'
+INDEXING = 'haptic_bridge/indexing'
 CUT = 'cutting/cut'
 MESH_RECOVERY_SERVICES = ('cutting/get_mesh', 'haptic_bridge/get_mesh', 'viewer/get_mesh')
 """Services that return the tissue after its owner has died."""

@@ -19,12 +19,23 @@ from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.recorded_tissue import first_tissue, tissue_at
 from cutting_trainer.bags.repair import repair_note
-from cutting_trainer.bags.topic_names import CUTS, POSE, of_session
+from cutting_trainer.bags.topic_names import (
+    CONTACT,
+    CUTS,
+    POSE,
+    SERVO_CF,
+    further_tools,
+    of_session,
+)
 from cutting_trainer.exercises.bag_feed import read_attempt
 from cutting_trainer.exercises.score import UNITS, in_words, score
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ScriptSettings
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE
-from cutting_trainer.node_common.cdr_codec import PoseStampedCodec
+from cutting_trainer.node_common.cdr_codec import (
+    ContactCodec,
+    PoseStampedCodec,
+    WrenchStampedCodec,
+)
 from cutting_trainer.recordings.incision_metrics import (
     distance_to_paths,
     extent,
@@ -131,6 +142,7 @@ def _body(
         *_exercise(bag, scene),
         '<h2>The cut</h2>',
         _table(_cut_numbers(bag, story, depth, tool, script)),
+        *_further_tools(bag),
         _image(_path_figure(story, script), 'Path of the tip from above, and the plan.'),
         '<h2>Force, depth, speed</h2>',
         _image(
@@ -209,6 +221,27 @@ def _cut_numbers(
             ('the same, largest [mm]', _mm(off.max())),
         ]
     return rows
+
+
+def _further_tools(bag: Bag) -> list[str]:
+    """Return contact and force of each further tool as a table; [] where there is none."""
+    state = ContactCodec.fields['state'].start
+    force = WrenchStampedCodec.fields['force']
+    rows: list[tuple[str, ...]] = []
+    for tool in further_tools(bag.topics()):
+        contacts = [ContactCodec().decode(m.data) for m in bag.messages([f'{tool}{CONTACT}'])]
+        states = np.array([sample.values[state] for sample in contacts])
+        times = np.array([sample.stamp_ns for sample in contacts]) * 1e-9
+        steps = np.diff(times, append=times[-1:])
+        wrench = of_session(f'{tool}{SERVO_CF}', bag.topics())
+        forces = [WrenchStampedCodec().decode(m.data).values[force] for m in bag.messages([wrench])]
+        most = np.linalg.norm(np.reshape(forces, (-1, 3)), axis=1).max(initial=0.0)
+        touched, held = (float(steps[mask].sum()) for mask in (states != NONE, states == INSIDE))
+        rows.append((escape(tool[1:]), f'{touched:.1f}', f'{held:.1f}', f'{most:.2f}'))
+    if not rows:
+        return []
+    head = ('tool', 'contact [s]', 'holds the tissue, or is in it [s]', 'largest force [N]')
+    return ['<h2>The other tools</h2>', _table(rows, head)]
 
 
 def incision_area(bag: Bag) -> float:

@@ -20,7 +20,7 @@ from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.recorded_frames import first_keyframe
 from cutting_trainer.bags.recorded_tissue import first_current_keyframe
 from cutting_trainer.bags.topic_names import (
-    BUTTON,
+    BUTTONS,
     FORCES,
     OF_TISSUE,
     POSE,
@@ -155,7 +155,7 @@ def _drive(options: ReplayOptions, bag: Bag, context: Context, domain: int) -> S
         ):
             try:
                 player.reject_live_input(
-                    [*OF_TISSUE, *FORCES, *(REPLAYED + t for t in (POSE, BUTTON))]
+                    [*OF_TISSUE, *FORCES, *(REPLAYED + t for t in (POSE, *BUTTONS))]
                 )
                 _check(player)
                 player.advertise()
@@ -213,7 +213,7 @@ def replay_nodes(
     """
     resumed = {} if tissue is None else {'resume': True, 'checkpoint': str(tissue)}
     common = {'scene': str(scene), 'seed': 0}
-    remapped = {topic[1:]: f'{REPLAYED}{topic}' for topic in (POSE, BUTTON)}
+    remapped = {topic[1:]: f'{REPLAYED}{topic}' for topic in (POSE, *BUTTONS)}
     if not drive_device:
         remapped |= {topic[1:]: f'{REPLAYED}{topic}' for topic in FORCES}
     nodes = [

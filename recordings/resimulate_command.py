@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -19,6 +18,7 @@ from rich.progress import Progress
 from cutting_trainer.bags.comparison import Comparison, compare
 from cutting_trainer.bags.metadata import recorded_code
 from cutting_trainer.bags.reader import Bag, open_bag
+from cutting_trainer.bags.recorded_frames import ToolRecord
 from cutting_trainer.bags.repair import repair_note
 from cutting_trainer.bags.resimulation import Resimulation
 from cutting_trainer.bags.resimulation_start import ComputationStart, find_beginning
@@ -26,6 +26,7 @@ from cutting_trainer.cutting.memory import from_state as memory_of
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.haptic_bridge import force_kernels
+from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.node_common.code_identity import CodeIdentity, identity_here
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.what_if import recorded_run, run_experiment
@@ -105,7 +106,7 @@ def recomputation(
     return computed
 
 
-def pose_check(scene: Scene) -> Callable[[Any, Any, int], float]:
+def pose_check(scene: Scene) -> Callable[[ToolRecord, int], float]:
     """Return a function for the distance [m] between the tool of a contact and of a device pose."""
     setups = [
         force_kernels.make_setup(one.tool, one.device, one.haptics, one.profile)
@@ -113,7 +114,12 @@ def pose_check(scene: Scene) -> Callable[[Any, Any, int], float]:
     ]
     state = np.zeros(1, force_kernels.STATE)
 
-    def distance(pose: Any, contact: Any, number: int) -> float:
+    scenes = [Indexing.of(one.device.tissue_from_device) for one in scene.tools]
+
+    def distance(tool: ToolRecord, number: int) -> float:
+        contact, pose = tool.contact, tool.pose
+        assert pose is not None
+        (tool.indexing or scenes[number]).write(setups[number])
         force_kernels.to_tissue(setups[number], state, np.array(pose.values))
         root, tip = state[0]['blade']
         pairs = (

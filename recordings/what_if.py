@@ -6,6 +6,7 @@ many frames as in the session. The hand does not yield to the force: it follows 
 The result is compared with the recorded session, of which only the tissue is recomputed.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,11 +19,13 @@ from rich.table import Table
 from cutting_trainer.bags.comparison import MAX_ROUNDING
 from cutting_trainer.bags.reader import Bag
 from cutting_trainer.bags.recorded_frames import FrameRecord, contact_message, read_run
+from cutting_trainer.bags.recorded_indexings import recorded_indexings
 from cutting_trainer.bags.resimulation import Resimulation, answer_frames, as_recorded
 from cutting_trainer.bags.resimulation_start import find_beginning
 from cutting_trainer.bags.topic_names import CONTACT, POSE, SERVO_CF, of_session
 from cutting_trainer.haptic_bridge.force_kernels import NONE
 from cutting_trainer.haptic_bridge.force_path import ForcePath
+from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
@@ -132,6 +135,8 @@ class Hand:
         contact: contact of the last tick, None before the first.
         mode: recorded of the tool last; None before the first contact.
         ticks: time [ns], norm of the force [N] and contact flag of each tick.
+        indexings: recorded changes of how the hand moves the tool, that are to come.
+        indexing: the last one; None before the first.
     """
 
     path: ForcePath
@@ -141,6 +146,24 @@ class Hand:
     contact: StampedMessage | None = None
     mode: int | None = None
     ticks: list[tuple[int, float, bool]] = field(default_factory=list)
+    indexings: deque[Indexing] = field(default_factory=deque)
+    indexing: Indexing | None = None
+
+    def index(self, until: int) -> None:
+        """Clutch, and change the scale of the motion, as before a device pose, by its stamp [ns].
+
+        Before the first pose, the tool is where the session had it.
+        """
+        while self.indexings and self.indexings[0].after_ns < until:
+            before, self.indexing = self.indexing, self.indexings.popleft()
+            if before is None:
+                continue  # it is that of the scene, which may be changed
+            if not self.ticks:
+                self.path.coupling.resume(self.indexing)
+                continue
+            if before.scale != self.indexing.scale:
+                self.path.coupling.change(motion_scale=self.indexing.scale)
+            self.path.coupling.change(clutched=self.indexing.clutched)
 
     def follow(self, record: FrameRecord) -> int:
         """Change the tool as it was changed before a frame; return `time_of_contact`."""
@@ -152,6 +175,7 @@ class Hand:
 
     def tick(self, pose: StampedMessage) -> None:
         now = pose.stamp_ns
+        self.index(now)
         sample, self.sample = self.sample, None
         tick = self.path.tick(now, state=self.state, pose=pose, sample=sample, surface=self.surface)
         if tick.fault:
@@ -174,7 +198,7 @@ def run_experiment(bag: Bag, scene: Scene, computed: Resimulation) -> Run:
         SessionError: the bag has no poses, or the changed session ends in a FAULT.
     """
     records, poses = computable_poses(bag)
-    hand = Hand(make_force_path(scene))
+    hand = Hand(make_force_path(scene), indexings=deque(recorded_indexings(bag)))
     untils = (hand.follow(record) for record in records)
     computed.answer_frames = answer_frames(records)
     for _ in closed_loop(poses, untils, hand, computed):

@@ -16,6 +16,7 @@ from launch_ros.substitutions import FindPackageShare
 from cutting_trainer.session.node_commands import (
     ARM_NODE,
     BRIDGE_NODE,
+    DEVICE_TOPICS,
     RECORDER_NODE,
     VIEWER_NODE,
     discovery,
@@ -57,11 +58,6 @@ PARAMETERS = {
     VIEWER_NODE: ('scene', 'host', 'port', 'allow_host'),
 }
 """Parameters of the nodes that need others than `USUAL`."""
-DEVICE_TOPICS = (
-    *('measured_cp', 'servo_cf', 'body/servo_cf', 'spatial/servo_cf'),
-    *('button', 'operating_state', 'state_command'),
-)
-"""Topics between bridge, viewer and device."""
 
 
 def declared(*names: str, **defaults: str) -> list[Any]:

@@ -31,6 +31,11 @@ OF_A_TOOL = (ARM_NODE, BRIDGE_NODE)
 """Nodes that each tool has."""
 SHARED = ('tissue/mesh', 'tissue/mesh_updates', 'tissue/get_mesh', 'haptic_bridge/e_stop')
 """Topics and services of the graph that the bridge of a further tool uses."""
+DEVICE_TOPICS = (
+    *('measured_cp', 'servo_cf', 'body/servo_cf', 'spatial/servo_cf'),
+    *('button', 'clutch', 'operating_state', 'state_command'),
+)
+"""Topics between bridge, viewer and device."""
 RESTART_PARAMETERS: dict[str, dict[str, object]] = {
     BRIDGE_NODE: {'auto_enable': False},
     TISSUE_NODE: {'resume': True},
@@ -74,7 +79,7 @@ def session_nodes(
 
 
 def simulation_nodes(
-    scene: Path, seed: int, checkpoint: Path, tools: Sequence[str] = ()
+    scene: Path, seed: int, checkpoint: Path, tools: Sequence[str] = (), arm: str = ''
 ) -> list[NodeCommand]:
     """Return commands for a session that waits for its operator, without script and force.
 
@@ -83,6 +88,7 @@ def simulation_nodes(
         seed: seed of all random numbers.
         checkpoint: file of the tissue's state.
         tools: names of the further tools of the scene.
+        arm: namespace of a device whose driver runs; '': the emulated arm.
     """
     common = {'scene': str(scene), 'seed': seed}
     own: dict[str, dict[str, object]] = {
@@ -90,7 +96,21 @@ def simulation_nodes(
         BRIDGE_NODE: {'accepted_publishers': SESSION_PUBLISHERS},
         TISSUE_NODE: {'checkpoint': str(checkpoint)},
     }
-    return _nodes(common, own, tools)
+    nodes = _nodes(common, own, tools)
+    if not arm:
+        return nodes
+    bridge = node_command(BRIDGE_NODE, common, of_device(arm))
+    others = [node for node in nodes if node.name != ARM_NODE]
+    return [bridge if node.name == BRIDGE_NODE else node for node in others]
+
+
+def of_device(arm: str) -> dict[str, str]:
+    """Return the names of a device's topics, by those in the nodes' code.
+
+    Args:
+        arm: namespace of the device, as in /MTML for /MTML/measured_cp; '': that of the code.
+    """
+    return {f'arm/{topic}': f'{arm}/{topic}' for topic in DEVICE_TOPICS} if arm else {}
 
 
 def _nodes(
@@ -163,7 +183,13 @@ def sim_side_nodes(
 
 
 def viewer_command(
-    scene: Path, host: str, port: int, *, session: bool, allow_host: Sequence[str] = ()
+    scene: Path,
+    host: str,
+    port: int,
+    *,
+    session: bool,
+    allow_host: Sequence[str] = (),
+    arm: str = '',
 ) -> NodeCommand:
     """Return the command of the node that serves the page.
 
@@ -172,10 +198,11 @@ def viewer_command(
         host, port: address and port of the page.
         session: the launcher answers requests of the page.
         allow_host: host names under which the page is served.
+        arm: namespace of a device whose driver runs; '': the emulated arm.
     """
     parameters = {'scene': str(scene), 'host': host, 'port': port, 'session': session}
     parameters['allow_host'] = ','.join(allow_host)
-    return replace(node_command(VIEWER_NODE, parameters), converses=session)
+    return replace(node_command(VIEWER_NODE, parameters, of_device(arm)), converses=session)
 
 
 def node_command(

@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cutting_trainer.haptic_bridge.devices.convention import METRES
+from cutting_trainer.haptic_bridge.devices.placement import HOLD_S, LIFT_M
 from cutting_trainer.haptic_bridge.devices.probe_force import check_gain, check_push, check_release
 from cutting_trainer.haptic_bridge.devices.probe_pose import (
     QUARTER_TURN_DEG,
@@ -41,14 +43,12 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.node_commands import ARM_NODE, arm_command, node_environment
 from cutting_trainer.session.node_process import NodeProcess
+from cutting_trainer.session.place_device import MOVE_TIMEOUT_S, Guide
 
 REST_TIME_S = 3.0
 """Time of recording the arm at rest [s]."""
-MOVE_TIMEOUT_S = 30.0
-"""Time for each move [s]."""
 _START_TIMEOUT_S = 60.0
 _COLOURS = {'ok': 'green', 'wrong': 'bold red', 'unknown': 'yellow'}
-_METRES = {'m': 1.0, 'dm': 0.1, 'cm': 0.01, 'mm': 0.001}
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,10 @@ class ProbeOptions:
         domain: ROS domain, or `free`.
         as_json: print the checks as JSON.
         force_topic: topic below `arm` on which the device takes the force.
+        place: scene whose section `device` is to say where the device is; '': none.
+        points: known points in that scene's tissue frame, as `x,y,z` [m]; (): the corners of its
+            tissue's underside.
+        metres: one unit of the positions [m], by the scene.
     """
 
     arm: str = 'arm'
@@ -86,6 +90,9 @@ class ProbeOptions:
     domain: int | Literal['free'] = 0
     as_json: bool = False
     force_topic: str = 'servo_cf'
+    place: str = ''
+    points: tuple[str, ...] = ()
+    metres: float = 1.0
 
 
 def run_probe(options: ProbeOptions) -> Status:
@@ -99,20 +106,28 @@ def run_probe(options: ProbeOptions) -> Status:
         DriverFaults.read(options.emulation.faults if options.emulation else '')
     except ValueError as error:
         raise SessionError(f'--faults: {error}') from None
-    profile = DeviceSettings.model_construct(profile=options.profile).load_profile()
+    guide = None if not options.place else Guide.of(options.place, options.points)
+    if guide is None:
+        profile = DeviceSettings.model_construct(profile=options.profile).load_profile()
+    else:
+        profile, options = guide.profile, replace(options, metres=guide.metres)
     with reserved_domain(options.domain) as domain:
         # Here, for the ROS of this process, before its libraries read it.
         os.environ.update(node_environment(domain))
-        with _emulated(options, domain):
+        with _emulated(options, domain, guide):
             try:
-                checks = probe(options, profile, notes)
+                checks = probe(options, profile, notes, guide)
             except KeyboardInterrupt:
                 return Status.INTERRUPTED
+    if guide is not None:
+        checks.append(guide.write(checks))
     _show(checks, options, notes)
     return Status.FAILED if any(check.verdict == 'wrong' for check in checks) else Status.OK
 
 
-def probe(options: ProbeOptions, profile: DeviceProfile, notes: Console) -> list[ProbeCheck]:
+def probe(
+    options: ProbeOptions, profile: DeviceProfile, notes: Console, guide: Guide | None = None
+) -> list[ProbeCheck]:
     """Run all checks of an arm in the ROS domain of the environment."""
     import rclpy
 
@@ -122,14 +137,18 @@ def probe(options: ProbeOptions, profile: DeviceProfile, notes: Console) -> list
     rclpy.init(context=context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
     node = DeviceProbe(options.arm, context, options.force_topic)
     try:
-        return _checks(node, options, profile, notes)
+        return _checks(node, options, profile, notes, guide)
     finally:
         node.destroy_node()
         rclpy.shutdown(context=context)
 
 
 def _checks(
-    node: Any, options: ProbeOptions, profile: DeviceProfile, notes: Console
+    node: Any,
+    options: ProbeOptions,
+    profile: DeviceProfile,
+    notes: Console,
+    guide: Guide | None,
 ) -> list[ProbeCheck]:
     checks = [node.find()]
     if checks[0].measured == 'none':
@@ -139,8 +158,13 @@ def _checks(
     if poses is None:
         silent = f'{node.pose_topic} has a publisher that sends nothing: is the device on?'
         return [*checks, ProbeCheck('rate', 'wrong', 'silent', silent)]
-    checks += check_stream(poses, profile, node.pose_topic)
-    if options.moves:
+    scaled = replace(poses, values=poses.values * [*[options.metres] * 3, 1.0, 1.0, 1.0, 1.0])
+    checks += check_stream(scaled, profile, node.pose_topic)
+    if guide is not None:
+        if options.emulation is not None:
+            node.enable()
+        checks += guide.lead(node, notes)
+    elif options.moves:
         if options.emulation is not None:
             node.enable()
         moves = _moves(node, extent(poses.positions), notes)
@@ -148,14 +172,15 @@ def _checks(
         if len(moves) == len(DIRECTIONS):
             checks += _scale_and_turn(node, moves, checks, extent(poses.positions), notes)
     if options.push:
-        checks += _push(node, checks, notes)
+        metres = _metres(checks) if guide is None else guide.metres
+        checks += _push(node, metres, notes)
     return [*checks, check_frame(node.frames, node.pose_topic)]
 
 
 def _metres(checks: list[ProbeCheck]) -> float:
     """Return one unit of the positions [m], by the check of the moves."""
     units = [c.measured.split()[1] for c in checks if c.name == 'unit' and c.measured]
-    return _METRES[units[0]] if units else 1.0
+    return METRES[units[0]] if units else 1.0
 
 
 def _scale_and_turn(
@@ -194,7 +219,7 @@ def _moves(node: Any, noise: float, notes: Console) -> list[np.ndarray]:
     return moves
 
 
-def _push(node: Any, checks: list[ProbeCheck], notes: Console) -> list[ProbeCheck]:
+def _push(node: Any, metres: float, notes: Console) -> list[ProbeCheck]:
     from cutting_trainer.haptic_bridge.devices.probe_node import ProbeError
 
     state = node.state()
@@ -203,7 +228,7 @@ def _push(node: Any, checks: list[ProbeCheck], notes: Console) -> list[ProbeChec
         return [ProbeCheck('force', 'unknown', state, why)]
     notes.print(f'Hold the arm loosely: it is pushed with {PUSH_FORCE_N:g} N along each axis.')
     try:
-        pushes = node.push(_metres(checks))
+        pushes = node.push(metres)
     except ProbeError as error:
         return [ProbeCheck('force', 'unknown', 'stopped', str(error))]
     last = pushes.times, pushes.along, pushes.deflection, pushes.still_felt
@@ -215,14 +240,15 @@ def _push(node: Any, checks: list[ProbeCheck], notes: Console) -> list[ProbeChec
 
 
 @contextmanager
-def _emulated(options: ProbeOptions, domain: int) -> Iterator[None]:
+def _emulated(options: ProbeOptions, domain: int, guide: Guide | None) -> Iterator[None]:
     """Run the emulated arm for the probe, if requested."""
     if options.emulation is None:
         yield
         return
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / 'probe.yaml'
-        scene.write_text(json.dumps(emulated_scene(options.emulation, options.force_topic)))
+        content = emulated_scene(options.emulation, options.force_topic, guide)
+        scene.write_text(json.dumps(content))
         faults = {'faults': options.emulation.faults} if options.emulation.faults else {}
         command = arm_command(scene, auto_enable=False, wait_for_bridge=False, **faults)
         arm = NodeProcess(command, Path(folder) / 'log' / 'arm.log', node_environment(domain))
@@ -236,11 +262,27 @@ def _emulated(options: ProbeOptions, domain: int) -> Iterator[None]:
             arm.pipe.close()
 
 
-def emulated_scene(emulation: Emulation, force_topic: str) -> dict[str, Any]:
-    """Return a scene in which the hand makes the moves and the rotation once the arm is enabled."""
+def emulated_scene(
+    emulation: Emulation, force_topic: str, guide: Guide | None = None
+) -> dict[str, Any]:
+    """Return a scene in which the hand does what is asked once the arm is enabled."""
+    if guide is not None:
+        start = [*guide.points[0, :2].tolist(), float(guide.points[0, 2]) + LIFT_M]
+        return _scripted(emulation, force_topic, start, guide.goals, 3 * HOLD_S)
     moves = np.vstack([REQUESTED_MOVE_M * np.eye(3), [-RULER_LENGTH_M, 0.0, 0.0]])
     goals: list[dict[str, Any]] = [{'position': p} for p in np.cumsum(moves, axis=0).tolist()]
     goals.append(goals[-1] | {'rpy_deg': [0.0, 0.0, QUARTER_TURN_DEG]})
+    return _scripted(emulation, force_topic, [0.0, 0.0, 0.0], goals, 1.5)
+
+
+def _scripted(
+    emulation: Emulation,
+    force_topic: str,
+    start: list[float],
+    goals: list[dict[str, Any]],
+    seconds: float,
+) -> dict[str, Any]:
+    """Return a scene of a hand that takes some seconds for each goal, two thirds at rest."""
     phases: list[dict[str, Any]] = []
     for goal in goals:
         phases += [
@@ -248,7 +290,7 @@ def emulated_scene(emulation: Emulation, force_topic: str) -> dict[str, Any]:
             {'kind': 'rest', 'share': 1.0},
         ]
     device = {'force_topic': force_topic, **emulation.device}
-    script = {'start': {'position': [0.0, 0.0, 0.0]}, 'seconds': 7.5, 'phases': phases}
+    script = {'start': {'position': start}, 'seconds': seconds * len(goals), 'phases': phases}
     return {'arm': {'script': script, **emulation.arm}, 'device': device}
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
+from cutting_trainer.haptic_bridge.devices.convention import METRES
 from cutting_trainer.node_common.errors import MeshError, SceneError
 from cutting_trainer.node_common.share_folder import scene_names
 from cutting_trainer.session.demo_command import new_bag, report_failed_start
@@ -26,6 +27,7 @@ from cutting_trainer.session.node_commands import (
 )
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.outcome import Outcome
+from cutting_trainer.session.probe_command import ProbeOptions, probe
 from cutting_trainer.session.progress import SessionProgress
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.session.scene_overrides import write_changed
@@ -51,6 +53,8 @@ class ViewOptions:
         seed: seed of all random numbers.
         domain: ROS domain, or `free`.
         allow_host: host names under which the page is served.
+        arm: namespace of a device whose driver runs; '': the emulated arm.
+        record: record from the start.
     """
 
     scene: str
@@ -60,6 +64,8 @@ class ViewOptions:
     seed: int
     domain: int | Literal['free']
     allow_host: tuple[str, ...] = ()
+    arm: str = ''
+    record: bool = False
 
 
 def run_view(options: ViewOptions) -> Status:
@@ -70,6 +76,8 @@ def run_view(options: ViewOptions) -> Status:
     """
     scene = load_scene(options.scene)
     notes = session_console()
+    if options.arm:
+        require_device(options, scene, notes)
     # Rejected here, before the start of any node; every start of the viewer has the token.
     gate = make_gate(options.host, options.allow_host)
     os.environ[TOKEN_VARIABLE] = gate.token
@@ -79,6 +87,7 @@ def run_view(options: ViewOptions) -> Status:
         options.port,
         session=not options.attach,
         allow_host=options.allow_host,
+        arm=options.arm,
     )
     if options.attach:
         domain = 0 if options.domain == 'free' else options.domain
@@ -88,7 +97,7 @@ def run_view(options: ViewOptions) -> Status:
         tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
     ):
         session = _Session(scene, options, Path(temporary), notes)
-        nodes = [viewer, *session.nodes()]
+        nodes = [viewer, *session.nodes(), *session.recorder()]
         with (
             SessionProgress(notes, len(nodes)) as progress,
             Supervisor(
@@ -103,6 +112,32 @@ def run_view(options: ViewOptions) -> Status:
                 supervisor.run(_FOREVER, tick=lambda _: session.serve(supervisor))
             outcome = supervisor.end()
         return _status(outcome, Path(temporary), notes)
+
+
+def require_device(options: ViewOptions, scene: Scene, notes: Console) -> None:
+    """Check the device of a session, by what its driver sends.
+
+    Args:
+        options: of the command line.
+        scene: whose profile and topics the device has.
+        notes: console for what is done.
+
+    Raises:
+        SessionError: the device cannot be used; the message has the reasons.
+    """
+    if options.domain == 'free':
+        raise SessionError('--arm: the driver runs in a ROS domain: name that, not --domain free')
+    device = scene.device
+    metres = METRES[device.length_unit]
+    os.environ.update(node_environment(options.domain))
+    checks = probe(
+        ProbeOptions(options.arm, moves=False, force_topic=device.force_topic, metres=metres),
+        scene.profile,
+        notes,
+    )
+    wrong = [check.sentence for check in checks if check.verdict == 'wrong']
+    if wrong:
+        raise SessionError(f'--arm {options.arm}: {"; ".join(wrong)}')
 
 
 def _attach(viewer: NodeCommand, domain: int, notes: Console) -> Status:
@@ -149,7 +184,15 @@ class _Session:
         """Return the commands of the nodes that restart together."""
         tools = [tool.label for tool in self._scene.others]
         checkpoint = self._folder / 'tissue.checkpoint'
-        return simulation_nodes(self._file, self._options.seed, checkpoint, tools)
+        arm = self._options.arm
+        return simulation_nodes(self._file, self._options.seed, checkpoint, tools, arm)
+
+    def recorder(self) -> list[NodeCommand]:
+        """Return the command of the recorder, where it is to record from the start."""
+        if not self._options.record:
+            return []
+        self._recording = new_bag(None, self._scene.name)
+        return [recorder_command(self._file, self._recording, self._options.seed)]
 
     def event_handler(self, progress: SessionProgress) -> Callable[[Event], None]:
         """Return a handler of the supervisor's events."""

@@ -187,11 +187,8 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     },
     './trainer run PROGRAM ...': Nowhere('PROGRAM stands for what others of these commands run'),
     './trainer probe-device --arm /MTML --profile dvrk_mtm': Nowhere('needs a real arm'),
-    './trainer bridge-side --no-arm --scene block --bag NEW': Nowhere('needs a real arm'),
-    './trainer sim-side --scene block': Nowhere('the other half of a session with a real arm'),
-    './trainer view --attach --scene block': Nowhere(
-        'test_page_is_served_until_ctrl_c runs it with the usual scene'
-    ),
+    './trainer probe-device --arm /MTML --place my_scene.yaml': Nowhere('needs a real arm'),
+    './trainer view --arm /MTML --scene my_scene.yaml --record': Nowhere('needs a real arm'),
     './trainer import-mesh organ.msh --unit m -o organs/organ': Nowhere(
         'test_regions.py imports labelled tetrahedra by the same function'
     ),

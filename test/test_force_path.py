@@ -399,13 +399,13 @@ def test_force_scale_may_change_while_pressing_and_never_faster_than_the_slew():
     rig = Rig()
     rig.run(lowered(5e-3, 300))
     before = rig.run(np.full(200, RADIUS - 5e-3))[-1, 2]
-    rig.path.scale_force(2.0)
+    rig.path.coupling.change(force_scale=2.0)
     after = rig.run(np.full(200, RADIUS - 5e-3))[:, 2]
     assert after[-1] == pytest.approx(2 * before, rel=0.05)
     assert np.diff(np.concatenate([[before], after])).max() <= PROFILE.max_slew * 1e-3 + 1e-12
     with pytest.raises(SettingsError, match='the device bears 1000 N/m'):
-        rig.path.scale_force(6.0)
+        rig.path.coupling.change(force_scale=6.0)
     for wrong in (0.0, -1.0, np.nan):
         with pytest.raises(ValueError, match='force_scale'):
-            rig.path.scale_force(wrong)
+            rig.path.coupling.change(force_scale=wrong)
     assert rig.path.haptics.force_scale == 2.0

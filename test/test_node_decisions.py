@@ -20,7 +20,6 @@ from cutting_trainer.haptic_bridge.emulated_arm.faults import DriverFaults
 from cutting_trainer.haptic_bridge.emulated_arm.node import ArmNode
 from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.operating_state import CrtkState
-from cutting_trainer.node_common.rejections import MAX_TOOLS
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.streaming import link_budget
@@ -150,6 +149,7 @@ def cutting(revision: int) -> Any:
     settings, asked = CuttingSettings(), []
     return SimpleNamespace(
         _settings=settings,
+        _tools=2,
         _method=make_method(settings),
         _replica=replica,
         _mesh=replica.mesh(),
@@ -171,7 +171,9 @@ def answer(node: Any, **request: Any) -> tuple[int, str]:
 def test_a_cut_is_refused_with_the_reason_until_its_mesh_is_at_hand() -> None:
     node = cutting(7)
     assert answer(node)[0] == Cut.Response.OK
-    assert answer(node, tool=MAX_TOOLS)[0] == Cut.Response.INVALID_SWEEP
+    assert answer(node, tool=1)[0] == Cut.Response.OK
+    code, text = answer(node, tool=2)
+    assert code == Cut.Response.INVALID_SWEEP and 'the scene has 2, from 0' in text
     assert answer(node, command=9)[0] == Cut.Response.INVALID_SWEEP
     assert node.asked == []
     code, text = answer(node, revision=8)

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import rclpy
 from hypothesis import given
@@ -14,7 +15,8 @@ from hypothesis import strategies as st
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Joy
 
-from cutting_trainer.haptic_bridge.mode_button import ModeButton
+from cutting_trainer.haptic_bridge.device_button import DeviceButton
+from cutting_trainer.haptic_bridge.force_kernels import STATE
 from cutting_trainer.haptic_bridge.node import HapticBridge
 from cutting_trainer.node_common.crtk import REPLY_PERIOD_S
 from cutting_trainer.node_common.lifecycle import Stop
@@ -327,10 +329,29 @@ def test_the_mode_of_the_tool_is_a_parameter_and_a_button_changes_it(bridge: Hap
     assert not refused.successful and 'scalpel or palpator or open_grasper' in refused.reason
     bridge.set_parameters([Parameter('tool_mode', value='palpator')])
     assert bridge._path.next_mode == ToolMode.PALPATOR
-    button = ModeButton(bridge, 1, bridge._change_mode)
+    button = DeviceButton(bridge, 'button', 1, bridge._change_mode)
     for pressed in ([0, 0], [0, 1], [0, 1], [0, 0]):
         button._event(Joy(buttons=pressed))
     assert bridge._path.next_mode == ToolMode.SCALPEL
     assert bridge.get_parameter('tool_mode').value == 'scalpel'
     with pytest.raises(MessageError, match='no such button'):
         button._event(Joy(buttons=[0]))
+
+
+def test_the_scale_of_motion_is_a_parameter_and_a_button_is_the_clutch(bridge: HapticBridge):
+    refused = bridge.set_parameters([Parameter('motion_scale', value=60.0)])[0]
+    assert not refused.successful and 'the device bears' in refused.reason
+    assert bridge.set_parameters([Parameter('motion_scale', value=0.5)])[0].successful
+    coupling = bridge._path.coupling
+    state = np.zeros(1, STATE)
+    state['device'] = 0.1, 0.2, 0.3
+    state['orientation'] = 0.0, 0.0, 0.0, 1.0
+    before = coupling.indexing
+    coupling.carry_out(state, 5)
+    assert (before.scale, coupling.indexing.scale) == (1.0, 0.5)
+    assert coupling.indexing.after_ns == 5
+    for pressed in (1, 0):
+        bridge._clutch._event(Joy(buttons=[pressed]))
+        coupling.carry_out(state, 6)
+        assert coupling.indexing.clutched == pressed
+    assert [i.clutched for i in coupling.unsent] == [False, True, False]

@@ -34,7 +34,7 @@ from cutting_trainer.bags.playback_publishers import HandPlayer, SessionPlayer
 from cutting_trainer.bags.qos_adaptation import publisher_qos
 from cutting_trainer.bags.reader import Bag, Recorded, open_bag
 from cutting_trainer.bags.topic_names import (
-    BUTTON,
+    BUTTONS,
     CONTACT,
     FORCE,
     FORCES,
@@ -159,6 +159,7 @@ def test_the_recorded_hand_is_where_it_was() -> None:
     assert hand.pose(last + 9.0).stamp_ns > hand.pose((first + last) / 2).stamp_ns
 
 
+BUTTON = BUTTONS[0]
 PRESSES = {1.0: 0, 1.5: 1, 3.0: 0}
 """[s] of the session at which the button changes, and to what."""
 
@@ -176,7 +177,7 @@ def pressed(tmp_path: Path) -> Bag:
 
 def test_the_button_does_what_it_did_and_after_a_way_back_is_as_it_was_there(pressed: Bag) -> None:
     hand = RecordedHand(pressed)
-    recorded = [m.data for m in pressed.messages([BUTTON])]
+    recorded = [(BUTTON, m.data) for m in pressed.messages([BUTTON])]
     assert [pressed.read(m).buttons[0] for m in pressed.messages([BUTTON])] == [0, 1, 0]
     given, done = hand.events(0, 0.5)
     assert (given, done) == ([], 0)
@@ -204,7 +205,8 @@ def test_nodes_of_a_replay_speak_to_no_device_unless_told_to() -> None:
         bridge = next(node for node in nodes if node.name == 'haptic_bridge')
         return [word for word in bridge.argv if ':=/replay' in word]
 
-    of_device = ['arm/measured_cp:=/replay/arm/measured_cp', 'arm/button:=/replay/arm/button']
+    names = ('measured_cp', 'button', 'clutch')
+    of_device = [f'arm/{name}:=/replay/arm/{name}' for name in names]
     forces = [f'{force[1:]}:=/replay{force}' for force in FORCES]
     assert 'arm/servo_cf:=/replay/arm/servo_cf' in forces
     assert remapped(False) == [*of_device, *forces]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from meshes import box
 
+from bench.figures.arms_energy import accounts
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.in_process import Tissue
@@ -293,3 +294,17 @@ def test_a_session_with_two_tools_goes_on_from_its_state_with_the_same_bits() ->
         frames = [s.frame(*contacts).by_tool for s in (simulation, twin)]
         assert [one.felt for one in frames[0]] == [one.felt for one in frames[1]]
         assert frames[0][0].state == ContactState.INSIDE
+
+
+def test_the_work_of_both_tools_is_stored_lost_or_paid_for_the_cut() -> None:
+    found = accounts(rate=500.0)
+    lifted, cut, end = found.lifted, found.cut, found.end
+    assert abs(lifted.off) < 1e-4  # it holds the tissue, and nothing is cut yet
+    assert lifted.stored > 0.9 * lifted.work[1] > 5e-4
+    assert cut.paid > 5e-3
+    # Of losses in a frame of 2 ms a part is not seen; `bench.figures arms` takes shorter frames.
+    assert max(abs(cut.off), abs(end.off)) < 0.02
+    assert end.stored < 1e-6
+    # Either tool's work alone does not account for it.
+    assert abs(cut._replace(work=(cut.work[0], 0.0)).off) > 0.05
+    assert abs(cut._replace(work=(0.0, cut.work[1])).off) > 5.0

@@ -1,7 +1,9 @@
 """Two arms in one tissue over DDS: what is felt through it, who lives on when one of them dies."""
 
 import os
+import re
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,24 +11,33 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from live import (
+    PATIENCE,
+    ROOT,
     SERVO_CF,
     LiveSession,
     Recording,
     free_domain,
+    node_words,
     phase,
     wait_for,
     write_scene,
     zero_from,
 )
 from ruamel.yaml import YAML
+from std_msgs.msg import Empty
 
 from cutting_trainer.bags.comparison import compare
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec
+from cutting_trainer.node_common.qos import EVENTS
+from cutting_trainer.node_common.ros import E_STOP
+from cutting_trainer.recordings.html_report import write_report
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import pose_check, recomputation
 from cutting_trainer.session.exit_status import Status
+from cutting_trainer.session.node_commands import MODULES
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.tool import ContactState
 
@@ -101,6 +112,52 @@ def test_one_presses_while_the_other_lifts_and_all_is_the_same_again(
     assert result.identical, result
     assert not result.missing
     assert result.forces == 2 * result.frames
+    write_report(session.bag, tmp_path / 'report.html')
+    page = (tmp_path / 'report.html').read_text()
+    row = next(line for line in page.splitlines() if 'grasper' in line)
+    held = float(re.findall(r'<td>([\d.]+)</td>', row[row.index('grasper') :])[1])
+    inside = (states(recording, '/grasper') == ContactState.INSIDE).sum() / 30
+    assert held == pytest.approx(inside, abs=0.3)
+
+
+def test_a_press_of_e_stop_stops_both_hands(session: LiveSession) -> None:
+    for name in NAMES:
+        session.wait_until_said(f'grasper/{name} is ready')
+    session.wait_until_pressed(0.07)
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=session.domain)
+    node = rclpy.create_node('operator', context=context)
+    try:
+        publisher = node.create_publisher(Empty, E_STOP, EVENTS)
+        wait_for(lambda: publisher.get_subscription_count() >= 2, 'both bridges to listen')
+        now = time.time_ns()
+        publisher.publish(Empty())
+        session.end()
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+    recording = Recording(session.bag)
+    at = recording.at(now)
+    for tool in ('', '/grasper'):
+        times, norms = recording.force(tool + SERVO_CF)
+        assert times[-1] > at + 1.0
+        assert zero_from(times, norms) < at + 0.3
+
+
+def test_a_tool_that_the_scene_lacks_is_refused(tmp_path: Path) -> None:
+    words = node_words(MODULES['haptic_bridge'], '-p', f'scene:={two_arms(tmp_path)}')
+    environment = os.environ | {'ROS_DOMAIN_ID': str(free_domain())}
+    done = subprocess.run(
+        [*words, '-p', 'tool:=scissors'],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == Status.BAD_INPUT
+    assert "section tools has no 'scissors': known are grasper" in done.stdout + done.stderr
 
 
 def kill(session: LiveSession, node: str) -> int:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import Bag, Recorded
+from cutting_trainer.bags.recorded_indexings import recorded_indexings
 from cutting_trainer.bags.recorded_tissue import follow, tissue_messages
 from cutting_trainer.bags.topic_names import CONTACT, FORCE, MESH, POSE, SERVO_CF, of_session
 from cutting_trainer.node_common.cdr_codec import (
@@ -160,3 +161,4 @@ class RecordedTool:
         self.pose = Samples(bag, of_session(POSE, topics), PoseStampedCodec())
         self.wrench = Samples(bag, of_session(SERVO_CF, topics), WrenchStampedCodec())
         self.force = Samples(bag, FORCE, ForceSampleCodec())
+        self.indexings = recorded_indexings(bag)

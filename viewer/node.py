@@ -13,10 +13,12 @@ from typing import Any, get_args
 
 import numpy as np
 from cutting_trainer_msgs.msg import Contact, ForceSample
+from cutting_trainer_msgs.msg import Indexing as IndexingMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from visualization_msgs.msg import MarkerArray
 
+from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import ContactCodec, PoseStampedCodec, WrenchStampedCodec
@@ -95,6 +97,8 @@ class ViewerNode(ManagedNode):
         self._contact = Stream(self, Contact, ros.CONTACT, ContactCodec())
         self._wrench = Stream(self, WrenchStamped, self._force_topic, WrenchStampedCodec())
         self._pose = Stream(self, PoseStamped, f'{ros.ARM}/measured_cp', PoseStampedCodec())
+        self._indexing: Indexing | None = None
+        ros.listen(self, IndexingMessage, ros.INDEXING, self._take_indexing, qos.LATCHED)
         self._reactions = StreamRate()
         self._samples = ros.polled(self, ForceSample, ros.FORCE, qos.NEWEST_BEST_EFFORT)
         self._marker_array = self.create_publisher(MarkerArray, ros.MARKERS, qos.EVENTS)
@@ -187,7 +191,7 @@ class ViewerNode(ManagedNode):
         moment = None
         if self._contact.newest is not None:
             moment = self._translator.moment(
-                self._contact.newest, self._pose.newest, self._wrench.newest
+                self._contact.newest, self._pose.newest, self._wrench.newest, self._indexing
             )
         rates = (
             self._wrench.counter.rate(now) / self._nominal[0],
@@ -201,6 +205,9 @@ class ViewerNode(ManagedNode):
         self._page.show_nodes(now, self._statuses.now(now))
         self._follow_scale()
         self._publish_markers(now, moment)
+
+    def _take_indexing(self, message: IndexingMessage) -> None:
+        self._indexing = Indexing.read(message)
 
     def _serve(self, now: float) -> None:
         """Execute the queued work of pages, launcher and services."""

@@ -9,6 +9,7 @@ import numpy as np
 from cutting_trainer.bags.playback_control import Playhead
 from cutting_trainer.bags.playback_messages import duration
 from cutting_trainer.bags.reader import Bag
+from cutting_trainer.bags.recorded_indexings import indexing_at
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
 from cutting_trainer.viewer.access_control import Gate
@@ -170,7 +171,8 @@ class ReplayPage:
             contact = self._track.contact.at(position)
             if contact is not None:
                 pose, wrench = self._track.pose.at(position), self._track.wrench.at(position)
-                moment = self._translator.moment(contact, pose, wrench)
+                indexing = indexing_at(self._track.indexings, contact.stamp_ns)
+                moment = self._translator.moment(contact, pose, wrench, indexing)
                 put_moment(self.server, moment, self._depth(position), can_guide=False)
         self.server.put(
             'playhead',

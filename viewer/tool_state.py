@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
+from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec, StampedMessage, WrenchStampedCodec
 from cutting_trainer.node_common.orientation import from_quaternion, quaternion
@@ -51,7 +52,11 @@ class Translator:
         self._body = device.force_frame == 'body'
 
     def moment(
-        self, contact: StampedMessage, pose: StampedMessage | None, wrench: StampedMessage | None
+        self,
+        contact: StampedMessage,
+        pose: StampedMessage | None,
+        wrench: StampedMessage | None,
+        indexing: Indexing | None = None,
     ) -> Moment:
         """Combine the newest of each message.
 
@@ -59,6 +64,7 @@ class Translator:
             contact: `tool/contact`.
             pose: `arm/measured_cp`; None: identity orientation.
             wrench: `arm/servo_cf`; None: no force.
+            indexing: how the hand moves the tool; None: as the scene says.
         """
 
         def get(name: str) -> Floats:
@@ -71,6 +77,9 @@ class Translator:
         if wrench is not None:
             felt = self._convention.force(wrench.values)[WrenchStampedCodec.fields['force']]
             force = self._to_tissue @ (turned @ felt if self._body else felt)
+        if indexing is not None:
+            aligned = from_quaternion(indexing.alignment)
+            turned = aligned if indexing.clutched else turned @ aligned
         return Moment(
             tip=get('device'),
             orientation=np.roll(quaternion(self._to_tissue @ turned), 1),

@@ -31,12 +31,11 @@ class Subject(NamedTuple):
 SUBJECTS = {
     'arms': Subject(
         modules=('arms_two_tools',),
+        together=('arms_energy', 'arms_clutch', 'arms_placement'),
         not_covered={
-            1: 'of it: the energy account over both tools; 60 s take '
-            '`python -m bench.figures.arms_two_tools --seconds 60`',
-            2: 'there is no clutch yet',
+            1: 'of it: 60 s take `python -m bench.figures.arms_two_tools --seconds 60`',
+            2: 'of it: a thousand take `python -m bench.figures.arms_clutch --rounds 40 --each 25`',
             3: 'foreign programs are not run here',
-            4: 'there is no guided set-up yet',
             5: 'it takes a quiet machine: `./trainer bench speed`',
             6: 'it needs readers who have not seen the code',
         },

@@ -55,6 +55,14 @@ TOPICS = (
     ),
     Topic('arm/button', JOY, qos.EVENTS, 'arm', 'on event', 'buttons[0]: 1 pressed'),
     Topic(
+        'arm/clutch',
+        JOY,
+        qos.EVENTS,
+        'arm',
+        'on event',
+        'buttons[0]: 1 takes the hand off the tool',
+    ),
+    Topic(
         'arm/servo_cf',
         WRENCH,
         qos.STREAM,
@@ -69,6 +77,14 @@ TOPICS = (
         BRIDGE,
         '1 kHz',
         'where the tool is',
+    ),
+    Topic(
+        ros.INDEXING,
+        f'{OURS}/msg/Indexing',
+        qos.HISTORY,
+        BRIDGE,
+        'at start, on change',
+        'how the hand moves the tool',
     ),
     Topic(
         ros.FORCE,

@@ -6,7 +6,7 @@ All other code uses metres, right-handed frames, and the force on the hand.
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 
-_METRES = {'m': 1.0, 'dm': 0.1, 'cm': 0.01, 'mm': 0.001}
+METRES = {'m': 1.0, 'dm': 0.1, 'cm': 0.01, 'mm': 0.001}
 _MIRRORS = {
     'none': (1.0, 1.0, 1.0),
     'x': (-1.0, 1.0, 1.0),
@@ -26,7 +26,7 @@ class DeviceConvention:
     """
 
     def __init__(self, settings: DeviceSettings) -> None:
-        self._unit = _METRES[settings.length_unit]
+        self._unit = METRES[settings.length_unit]
         self._mirror = _MIRRORS[settings.mirrored_axis]
         mirrored = settings.mirrored_axis != 'none'
         self._torque_signs = tuple(-sign if mirrored else 1.0 for sign in self._mirror)

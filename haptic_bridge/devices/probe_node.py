@@ -11,6 +11,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from cutting_trainer.haptic_bridge.devices.placement import find_touch, why_no_touch
 from cutting_trainer.haptic_bridge.devices.probe_force import (
     MAX_UNCERTAINTY_DEG,
     direction_uncertainty,
@@ -171,6 +172,29 @@ class DeviceProbe(Node):
             if move is not None:
                 return move
         return None
+
+    def await_touch(self, metres: float, timeout: float, name: str) -> np.ndarray:
+        """Return where the tip rests after its next move, in the unit sent, shape (3,).
+
+        Args:
+            metres: one unit of the positions [m].
+            timeout: [s].
+            name: of the point, for the message.
+
+        Raises:
+            PlacementError: it did not move there, or was not still.
+        """
+        self._drain()
+        self._clear()
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline:
+            time.sleep(0.05)
+            self._drain()
+            if self._arrivals:
+                poses = self._all()
+                if (found := find_touch(poses.arrivals, poses.positions, metres)) is not None:
+                    return found
+        raise why_no_touch(np.array(self._values).reshape(-1, 7)[:, :3], metres, name)
 
     def await_rotation(self, timeout: float) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the orientations before and after the next rotation, as sent, shape (4,) each."""
