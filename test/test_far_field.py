@@ -14,6 +14,7 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
 from cutting_trainer.tissue_sim.motion.far_field import FarField
+from cutting_trainer.tissue_sim.motion.far_relaxation import LENGTHS
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 
 pytestmark = pytest.mark.long
@@ -73,7 +74,7 @@ def test_reduced_stiffness_is_galerkins_whatever_was_cut_and_wherever_the_tool_w
         n = mesh.node_count
         inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1 / elastic.mass), 3)
         u, v = np.zeros((2, 3 * n + far.extra))
-        region = far.choose(u, v, np.zeros((n, 3)), inverse, [tool])
+        region = far.choose(u, v, np.zeros((n, 3)), inverse, [tool], 1.0)
         free = np.zeros(n, bool)
         free[far.nodes] = True
         grid = far._grid
@@ -106,8 +107,23 @@ def test_a_footprint_that_goes_on_meets_nearly_the_resistance_of_all_nodes_movin
 ) -> None:
     shapes, forces = pressed(ActiveSettings(), integrator=integrator)
     some, felt = pressed(ActiveSettings('budget', NODES), integrator=integrator)
-    assert np.abs(felt - forces).max() < 0.04 * np.abs(forces).max()
-    assert np.abs(some - shapes).max() < 0.07 * np.abs(shapes).max()
+    assert np.abs(felt - forces).max() < 0.02 * np.abs(forces).max()
+    assert np.abs(some - shapes).max() < 0.04 * np.abs(shapes).max()
+
+
+def test_under_a_tool_that_stays_the_far_field_finds_the_shape_of_all_nodes() -> None:
+    """The grid alone would keep a part of its error for ever."""
+    whole, felt = pressed(ActiveSettings())
+    some, force = pressed(ActiveSettings('budget', NODES))
+    off = np.abs(some[15] - whole[15]).max() / np.abs(whole[15]).max()
+    assert off < 0.006
+    assert abs(force[15] / felt[15] - 1) < 1e-3
+
+
+def test_a_relaxation_leaves_a_third_at_most_of_what_it_is_for_and_adds_to_nothing() -> None:
+    left = np.abs(np.prod([1 - length * np.linspace(0, 1, 1001) for length in LENGTHS], axis=0))
+    assert left.max() <= 1.0
+    assert left[50:].max() < 1 / 3
 
 
 def test_more_nodes_err_less() -> None:
@@ -115,7 +131,7 @@ def test_more_nodes_err_less() -> None:
     errors = [
         np.abs(pressed(ActiveSettings('budget', k))[0][:16] - dent).max() for k in (60, 200, 600)
     ]
-    assert errors[2] < 0.5 * errors[1] < 0.25 * errors[0]
+    assert errors[2] < 0.6 * errors[1] < 0.3 * errors[0]
 
 
 def test_a_dent_that_was_left_behind_fades() -> None:

@@ -62,6 +62,7 @@ from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.elasticity.models import MODELS
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.warm_up import warm_up
 
@@ -86,6 +87,8 @@ for model in MODELS:
         place = mesh.rest.max(axis=0) * [0.5, 0.5, 1.0]
         simulation.frame(indenter_contact(mesh, place, np.array([0.0, 0.0, -1.0]), depth))
     assert simulation.dynamics.active_nodes == 100
+    simulation.apply_cut(TopologyDelta(removed_tetrahedra=np.arange(5)))
+    simulation.frame(None)
 report(before)
 """
 

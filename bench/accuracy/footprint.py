@@ -38,6 +38,19 @@ def block(cells: tuple[int, int, int], seed: int = 0) -> TetMesh:
     return TetMesh(mesh.rest + move, mesh.tetrahedra, mesh.rest[:, 2] < PLANE_TOLERANCE_M)
 
 
+def touched(mesh: TetMesh, place: Sequence[float] | Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Return nodes and weights of the point of a block's top above a place, [m], shape (2,)."""
+    corners = mesh.rest[mesh.triangles]
+    top = np.flatnonzero((corners[:, :, 2] > BLOCK[2] - PLANE_TOLERANCE_M).all(axis=1))
+    triangles = mesh.triangles[top].astype(np.int64)
+    corners = np.moveaxis(mesh.rest[triangles][:, :, :2], 1, 2)
+    system = np.concatenate([corners, np.ones((len(corners), 1, 3))], axis=1)
+    weights = np.linalg.solve(system, np.array([*place, 1.0])[None, :, None])[:, :, 0]
+    chosen = int(weights.min(axis=1).argmax())
+    positive = np.maximum(weights[chosen], 0.0)
+    return triangles[chosen], positive / positive.sum()
+
+
 class Press:
     """A block under a sphere.
 
@@ -62,8 +75,6 @@ class Press:
         self.model = ElasticModel(mesh, material, model)
         self._springs = ToolSprings(mesh, material.plane_modulus, contact)
         self._free = np.repeat(mesh.fixed == 0, 3)
-        corners = mesh.rest[mesh.triangles]
-        self._top = np.flatnonzero((corners[:, :, 2] > BLOCK[2] - PLANE_TOLERANCE_M).all(axis=1))
 
     def forces(
         self,
@@ -93,7 +104,7 @@ class Press:
     def _spring(
         self, place: Sequence[float], radius: float, depth: float, stiffness: float
     ) -> Coupling:
-        nodes, weights = self._touched(place)
+        nodes, weights = touched(self._mesh, place)
         tip = np.array([*place, BLOCK[2] - depth])
         contact = ToolContact(
             state=ContactState.TOUCHING,
@@ -109,14 +120,6 @@ class Press:
             blade_tip=tip,
         )
         return self._springs.spring(contact, 0.0, depth)
-
-    def _touched(self, place: Sequence[float]) -> tuple[NDArray[np.int64], Floats]:
-        triangles = self._mesh.triangles[self._top].astype(np.int64)
-        corners = np.moveaxis(self._mesh.rest[triangles][:, :, :2], 1, 2)
-        system = np.concatenate([corners, np.ones((len(corners), 1, 3))], axis=1)
-        weights = np.linalg.solve(system, np.array([*place, 1.0])[None, :, None])[:, :, 0]
-        chosen = int(weights.min(axis=1).argmax())
-        return triangles[chosen], np.maximum(weights[chosen], 0.0)
 
     def _compliance(self, spring: Coupling) -> float:
         load = np.zeros_like(self._mesh.rest)

@@ -58,6 +58,18 @@ SUBJECTS = {
             4: 'starting from empty caches takes minutes, and so does `./trainer test`',
         },
     ),
+    'scale': Subject(
+        modules=('scale_far_field',),
+        not_covered={
+            1: 'of it: 197,472 tetrahedra cut, and their frame, which take minutes: '
+            '`python -m bench.accuracy.far_field_session 197472`',
+            2: 'it needs a live session on a quiet machine: `./trainer bench timing`',
+            3: 'a tissue has one thread: there is no option of cores yet',
+            4: 'a thousand strokes take minutes: `./trainer bench strokes`',
+            5: 'there is no governor yet',
+            6: 'it needs a reader',
+        },
+    ),
     'tissue': Subject(
         modules=('tissue_contact', 'tissue_friction', 'tissue_law', 'tissue_relaxation'),
         not_covered={

@@ -123,7 +123,8 @@ class CoarseGrid:
         self._cell = np.zeros((n, 3), np.int64)
         self.columns, self.weights = np.full((n, 8), -1), np.zeros((n, 8))
         self._place(np.arange(n))
-        self._accept(*self._numbered(np.argwhere(np.ones(self._shape))))
+        every = np.ascontiguousarray(np.argwhere(np.ones(self._shape)))
+        self._accept(*self._numbered(every))
 
     def _place(self, nodes: np.ndarray) -> None:
         """Find the cells and weights of some nodes."""

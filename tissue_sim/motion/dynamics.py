@@ -356,7 +356,8 @@ class Dynamics:
             if _is_free(couplings):
                 self._active.relax(u, self._elastic.force, self.inverse_mass, self.omega)
                 self._elastic.whole(self.displacement)
-            return self._active.choose(u, v, self._elastic.force, self.inverse_mass, couplings)
+            force = self._elastic.force
+            return self._active.choose(u, v, force, self.inverse_mass, couplings, self.omega)
         b = self.material.beta
         some = len(contacts.nodes) and not self._active.whole
         pressed = self.cut_contact.force(contacts, u, v) if some else None
@@ -480,7 +481,9 @@ class Dynamics:
         u, v = (values[at] for values in self._state())
         inverse, diagonal = self._present_inverse(), self.model.diagonal
         if self._far is not None:
-            inverse, diagonal = self._far.inverse(inverse), self._far.diagonal(diagonal)
+            inverse = self._far.inverse(inverse)
+            if self.stepping.integrator == 'implicit':
+                diagonal = self._far.diagonal(diagonal)
         operands = region.operands
         if place is not None and self.loads is not None:
             operands = operands._replace(load=self.model.load[place.at[: 3 * place.moving]])

@@ -25,6 +25,7 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import Touched, grown
 from cutting_trainer.tissue_sim.motion.active_region import Region
 from cutting_trainer.tissue_sim.motion.coarse_grid import CoarseGrid
 from cutting_trainer.tissue_sim.motion.coarse_stiffness import CoarseStiffness
+from cutting_trainer.tissue_sim.motion.far_relaxation import LENGTHS, descend, gathered
 
 _CELLS_PER_NODE = 0.5
 """Cells of the grid, as a share of the free nodes."""
@@ -34,25 +35,9 @@ _LEVELS = 3
 _BENT, _STAYS_BENT = 0.12, 0.08
 """|F - I| at which a node becomes free, and at least has to be to stay so: up to there the tangent
 of a law or of a rotation is at most some twice the linear stiffness, and a frame is stable."""
-
-
-@kernel
-def _gathered(far, columns, weights, values, width, out):
-    """Add the nodes' values times their weights to those of the unknowns.
-
-    Args:
-        far: nodes, shape (k,).
-        columns, weights: see `CoarseGrid`.
-        values: so many numbers for each node, shape (width n,).
-        width: of these.
-        out: shape (width c,).
-    """
-    for node in far:
-        for k in range(8):
-            w = weights[node, k]
-            if w > 0.0:
-                for i in range(width):
-                    out[width * columns[node, k] + i] += w * values[width * node + i]
+_RING = 2.0
+"""Radius within which far nodes relax at each frame, relative to that of the free nodes: there the
+field is too curved for the grid."""
 
 
 @kernel
@@ -137,29 +122,6 @@ def _follow(far, columns, weights, u, v, start):
             v[3 * node + i] = speed
 
 
-@kernel
-def _relax(far, columns, weights, u, force, pull, inverse_mass, squared):
-    """Move far nodes along the acceleration that the unknowns do not have.
-
-    Args:
-        far: nodes, shape (k,).
-        columns, weights: see `CoarseGrid`.
-        u: displacement [m], changed, shape (3 n,).
-        force: elastic force [N], shape (3 n,).
-        pull: that on the unknowns over their mass [m/s^2], shape (3 c,).
-        inverse_mass: by coordinate [1/kg], shape (3 n,).
-        squared: displacement by an acceleration [s^2].
-    """
-    for node in far:
-        for i in range(3):
-            own = force[3 * node + i] * inverse_mass[3 * node + i]
-            for k in range(8):
-                w = weights[node, k]
-                if w > 0.0:
-                    own -= w * pull[3 * columns[node, k] + i]
-            u[3 * node + i] -= squared * own
-
-
 class FarField:
     """Free nodes around the tools, and the unknowns that move all others.
 
@@ -180,7 +142,10 @@ class FarField:
         cells = max(1, round(_CELLS_PER_NODE * nodes))
         self._grid = CoarseGrid(model.mesh, model.neighbours, cells)
         self._stiffness = CoarseStiffness(model, self._grid)
+        # All is in the sum: otherwise the first frame of a large tissue would take ten others'.
+        self._stiffness.evaluate_apart(np.zeros(n, bool), np.zeros(0, np.int64))
         self._level = np.full(n, _LEVELS + 1, np.uint8)
+        self._ring = np.full(n, _LEVELS + 1, np.uint8)
         self._far = np.zeros(0, np.int64)
         self._centres = np.zeros((0, 3))
         self._radius = 0.0
@@ -222,15 +187,17 @@ class FarField:
         force: np.ndarray,
         inverse_mass: np.ndarray,
         couplings: Sequence[Coupling],
+        omega: float,
     ) -> Region:
-        """Choose the free nodes, and begin anew from the present displacement.
+        """Choose the free nodes, and begin anew from the present displacement, the ring relaxed.
 
         Args:
             u: displacement with the unknowns, which become 0 [m], shape (3 (n + c),).
             v: velocity; that of unknowns follows nodes that are not free any more [m/s].
-            force: elastic force at u [N], shape (n, 3).
+            force: elastic force at u [N], follows it, shape (n, 3).
             inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
             couplings: of the tools.
+            omega: bound of the highest frequency [rad/s].
         """
         n, start = len(inverse_mass) // 3, len(inverse_mass)
         bent = self._bent(u, inverse_mass)
@@ -238,6 +205,8 @@ class FarField:
             before = self._level[:n] == 0
             self._select(couplings, bent)
             self._weigh(v, inverse_mass, before)
+            self._surround()
+        self._relax_ring(u, force, inverse_mass, omega)
         level = self._level[:n]
         operands = self.operands()
         u[start:] = 0.0
@@ -249,8 +218,8 @@ class FarField:
         rim = self._far[inside[self._far]]
         far_force, near_force = np.zeros((2, self.extra))
         grid, stiffness = self._grid, self._stiffness
-        _gathered(self._far, grid.columns, grid.weights, flat, 3, far_force)
-        _gathered(rim, grid.columns, grid.weights, f, 3, near_force)
+        gathered(self._far, grid.columns, grid.weights, flat, 3, far_force)
+        gathered(rim, grid.columns, grid.weights, f, 3, near_force)
         coarse = CoarseRows(
             start,
             3 * rim,
@@ -290,10 +259,7 @@ class FarField:
     def relax(
         self, u: np.ndarray, force: np.ndarray, inverse_mass: np.ndarray, omega: float
     ) -> None:
-        """Take a part of the fine shape, such as that of a dent, from far nodes.
-
-        It is a step of steepest descent without the part that the unknowns answer: it only takes
-        energy away.
+        """Take a part of the fine shape, such as that of a dent, from all far nodes.
 
         Args:
             u: displacement [m], changed, shape (3 n,).
@@ -301,12 +267,21 @@ class FarField:
             inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
             omega: bound of the highest frequency [rad/s].
         """
-        arrays, flat = (self._far, self._grid.columns, self._grid.weights), force.reshape(-1)
-        pull = np.zeros((self._grid.count, 3))
-        _gathered(*arrays, flat, 3, pull.reshape(-1))
-        mass = grown(self._mass, self._grid.count)[: self._grid.count, None]
-        pull = np.where(mass > 0.0, pull / np.maximum(mass, 1e-300), 0.0)
-        _relax(*arrays, u, flat, pull.reshape(-1), inverse_mass, 1.0 / omega**2)
+        descend(self._grid, self._far, self._mass, u, force, inverse_mass, omega**-2)
+
+    def _relax_ring(
+        self, u: np.ndarray, force: np.ndarray, inverse_mass: np.ndarray, omega: float
+    ) -> None:
+        """Relax the far nodes around the free ones; the force follows them."""
+        n = len(force)
+        ring, near = (np.flatnonzero(self._ring[:n] <= level) for level in (0, 1))
+        if len(ring) == 0:
+            return
+        operands, f = self._model.operands_within(self._ring[:n], 1), np.zeros(3 * n)
+        for length in LENGTHS:
+            descend(self._grid, ring, self._mass, u, force, inverse_mass, length * omega**-2)
+            internal_force(operands, u[: 3 * n], f, 1)
+            force[near] = f.reshape(-1, 3)[near]
 
     def release(self, touched: Touched) -> None:
         """Prepare a change of connectivity: the mesh has changed, the model not yet."""
@@ -316,7 +291,10 @@ class FarField:
 
     def follow_cut(self, touched: Touched) -> None:
         """Follow a change of connectivity, after the model."""
-        self._level = grown(self._level, self._model.mesh.node_count, fill=_LEVELS + 1)
+        n = self._model.mesh.node_count
+        self._level, self._ring = (
+            grown(level, n, fill=_LEVELS + 1) for level in (self._level, self._ring)
+        )
         self._grid.follow_cut(touched, self._take_out)
         self._changed = True
 
@@ -389,6 +367,15 @@ class FarField:
         self._stiffness.evaluate_apart(near, free)
         self._changed = False
 
+    def _surround(self) -> None:
+        """Take the far nodes near the tools as the ring."""
+        mesh = self._model.mesh
+        rank = np.full(mesh.node_count, np.inf)
+        if len(self._centres):
+            _rank(mesh.rest, self._centres, rank)
+        near = self._far[rank[self._far] <= (_RING * self._radius) ** 2]
+        self._ring = self._model.neighbours.levels(near, _LEVELS)
+
     def _weigh(self, v: np.ndarray, inverse_mass: np.ndarray, before: np.ndarray) -> None:
         """Weigh the unknowns; nodes that are not free any more give them their momentum.
 
@@ -421,5 +408,5 @@ class FarField:
         values[nodes, 3] = 1.0 / inverse_mass[3 * nodes]
         values[nodes, :3] = values[nodes, 3:] * v[nodes]
         both = np.zeros((grid.count, 4))
-        _gathered(nodes, grid.columns, grid.weights, values.ravel(), 4, both.reshape(-1))
+        gathered(nodes, grid.columns, grid.weights, values.ravel(), 4, both.reshape(-1))
         return both[:, 3], both[:, :3]

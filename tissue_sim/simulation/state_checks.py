@@ -319,6 +319,7 @@ def _check_far_field(dynamics: Any, n: int) -> None:
     within('neighbours', stiffness.neighbours, max(3 * count, 1))
     has_room('blocks', stiffness.blocks, 9 * slots + 1)
     has_room('_level', far._level, n)
+    has_room('_ring', far._ring, n)
     within('_far', far._far, n)
     has_room('_centres', far._centres, 0, 3)
     has_room('_mass', far._mass, 0)
