@@ -98,6 +98,29 @@ def read_section(path: Path, section: str, model: type[M], tool: str = '') -> M:
         raise SceneError(_most_helpful(place, error.errors())) from None
 
 
+def read_document(path: Path, model: type[M], kind: str) -> M:
+    """Read and check a whole file of another kind than a scene, by one model.
+
+    Args:
+        path: the file.
+        model: model of the file, preferably derived from `SceneModel`.
+        kind: name of its kind for messages, as in `study`.
+
+    Raises:
+        SceneError: one sentence with file, line, key, value and remedy.
+    """
+    root = _compose(path, kind, tuple(model.model_fields))
+    document = _plain(root, path, ())
+    try:
+        return model.model_validate_json(
+            json.dumps(document, default=str),
+            strict=True,
+            context={'folder': path.parent.resolve()},
+        )
+    except ValidationError as error:
+        raise SceneError(_most_helpful(_Place(path, '', root, model), error.errors())) from None
+
+
 def tool_names(path: Path) -> tuple[str, ...]:
     """Return the names of the further tools of a scene, in their order; (): it has one tool.
 
@@ -155,9 +178,11 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def _compose(path: Path) -> MappingNode:
+def _compose(
+    path: Path, kind: str = 'scene', known: tuple[str, ...] = SECTIONS
+) -> MappingNode:
     if not path.is_file():
-        raise SceneError(f'scene file {missing_file(path)}')
+        raise SceneError(f'{kind} file {missing_file(path)}')
     try:
         text = bounded_yaml(path)
         root = YAML(typ='safe', pure=True).compose(text)
@@ -165,13 +190,13 @@ def _compose(path: Path) -> MappingNode:
         raise SceneError(error.of(path)) from None
     except UnicodeDecodeError as error:
         raise SceneError(
-            f'{path}: byte {error.start} is not UTF-8 text: a scene is a YAML file'
+            f'{path}: byte {error.start} is not UTF-8 text: a {kind} is a YAML file'
         ) from None
     except OSError as error:
         raise SceneError(f'{path} cannot be read: {error.strerror}') from None
     except YAMLError as error:
         raise SceneError(syntax_error(path, error)) from None
-    expected = f'a scene is a mapping of the sections {", ".join(SECTIONS)}'
+    expected = f'a {kind} is a mapping of the sections {", ".join(known)}'
     if root is None:
         raise SceneError(f'{path} is empty: {expected}')
     if not isinstance(root, MappingNode):
@@ -326,7 +351,7 @@ class _Place:
 
         Parts of `loc` that name a model are skipped.
         """
-        node, line, keys = self.node, _line(self.node), [self.section]
+        node, line, keys = self.node, _line(self.node), [self.section] if self.section else []
         for part in loc:
             found = _key_and_value(node, part)
             if found is not None:
@@ -338,7 +363,7 @@ class _Place:
         line, keys = self.locate(error['loc'])
         models, field = _described(self.model, error['loc'])
         about = f' ({field.description})' if field is not None and field.description else ''
-        head = f'{self.path}:{line}: {_dotted(keys)}'
+        head = f'{self.path}:{line}: {_dotted(keys) or "the file"}'
         if error['type'] == 'missing':
             return f'{head} is {_short(error["input"])}: {error["loc"][-1]} is missing{about}'
         if error['type'] == 'extra_forbidden':
@@ -380,16 +405,17 @@ def _described(
             models = narrowed or models
             continue
         field = fields[0]
-        inner = [m for f in fields for m in _models_in(f.annotation)]
+        inner = [m for f in fields for m in models_in(f.annotation)]
         if i + 1 < len(loc):
             models = inner or models
     return models, field
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models within the type of a field."""
     if isinstance(annotation, types.GenericAlias) or typing.get_origin(annotation) is not None:
         for argument in typing.get_args(annotation):
-            yield from _models_in(argument)
+            yield from models_in(argument)
     elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
 
