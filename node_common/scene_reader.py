@@ -178,9 +178,7 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def _compose(
-    path: Path, kind: str = 'scene', known: tuple[str, ...] = SECTIONS
-) -> MappingNode:
+def _compose(path: Path, kind: str = 'scene', known: tuple[str, ...] = SECTIONS) -> MappingNode:
     if not path.is_file():
         raise SceneError(f'{kind} file {missing_file(path)}')
     try:

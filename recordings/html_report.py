@@ -1,7 +1,5 @@
 """`trainer report`: a session on one page, for trainee and teacher."""
 
-import base64
-import io
 import math
 import tempfile
 from datetime import UTC, datetime
@@ -23,6 +21,7 @@ from cutting_trainer.bags.topic_names import CUTS, POSE, of_session
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ScriptSettings
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE
 from cutting_trainer.node_common.cdr_codec import PoseStampedCodec
+from cutting_trainer.recordings.html_page import image, page, table
 from cutting_trainer.recordings.incision_metrics import (
     distance_to_paths,
     extent,
@@ -46,19 +45,6 @@ _SAMPLE_STRIDE = 20
 """Every 20th contact is a sample of depth and speed: 20 ms."""
 _MAX_PEAKS = 5
 _MIN_PEAK_DISTANCE_S = 0.5  # [s]
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{font: 16px/1.45 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
-  color: #222}}
-h1 {{font-size: 1.5rem}} h2 {{font-size: 1.15rem; margin-top: 2rem}}
-table {{border-collapse: collapse}}
-td, th {{padding: .15rem .8rem .15rem 0; text-align: left; border-bottom: 1px solid #ddd}}
-td + td, th + th {{text-align: right}} img {{max-width: 100%}}
-figcaption, .note {{color: #555; font-size: .9rem}} figure {{margin: 1rem 0}}
-</style></head><body>
-{body}
-</body></html>
-"""
 
 
 def write_report(folder: Path, file: Path) -> Summary:
@@ -85,7 +71,7 @@ def write_report(folder: Path, file: Path) -> Summary:
     with mpl.rc_context(STYLE):
         body = _body(bag, story, before, summary, scene)
     title = f'Session {folder.resolve().name}'
-    file.write_text(_PAGE.format(title=escape(title), body=body), encoding='utf-8')
+    file.write_text(page(title, body), encoding='utf-8')
     return summary
 
 
@@ -125,21 +111,21 @@ def _body(
     parts = [
         f'<h1>Session {escape(Path(summary.bag).resolve().name)}</h1>',
         f'<p class="note">{begun:%Y-%m-%d %H:%M:%S} UTC, {summary.duration:.1f} s; {about}</p>',
-        _table(_numbers(story, summary, depth)),
+        table(_numbers(story, summary, depth)),
         '<h2>The cut</h2>',
-        _table(_cut_numbers(bag, story, depth, tool, script)),
-        _image(_path_figure(story, script), 'Path of the tip from above, and the plan.'),
+        table(_cut_numbers(bag, story, depth, tool, script)),
+        image(_path_figure(story, script), 'Path of the tip from above, and the plan.'),
         '<h2>Force, depth, speed</h2>',
-        _image(
+        image(
             _time_figure(story, tool, depth, hand_speed(bag)),
             "Grey: contact; red: the blade is in the tissue. Depth is that of the blade's end "
             'under the surface at rest. Marked are the largest peaks of the force.',
         ),
-        _table(_peaks(story), ('peak at [s]', 'force [N]', 'while')),
+        table(_peaks(story), ('peak at [s]', 'force [N]', 'while')),
         '<h2>Tissue before and after</h2>',
-        _image(_tissue_figure(story, before), 'Dark red: cut faces.'),
+        image(_tissue_figure(story, before), 'Dark red: cut faces.'),
         '<h2>Rates</h2>',
-        _table(
+        table(
             [_node_row(node) for node in summary.nodes.values() if not math.isnan(node.rate)],
             ('node', 'rate / lowest [Hz]', 'in time [%]', 'period p99 / worst [ms]', 'missed'),
         ),
@@ -306,23 +292,6 @@ def _tissue_figure(story: Story, before: MeshReplica) -> Figure:
     draw_tissue(left, Story(replica=before, moment=first))
     draw_tissue(right, Story(replica=story.replica, moment=story.moment))
     return figure
-
-
-def _image(figure: Figure, caption: str) -> str:
-    out = io.BytesIO()
-    figure.savefig(out, format='png', dpi=110)
-    text = base64.b64encode(out.getvalue()).decode()
-    said = escape(caption)
-    return (
-        f'<figure><img alt="{said}" src="data:image/png;base64,{text}">'
-        f'<figcaption>{said}</figcaption></figure>'
-    )
-
-
-def _table(rows: list[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
-    lines = [f'<tr>{"".join(f"<th>{escape(cell)}</th>" for cell in head)}</tr>'] if head else []
-    lines += [f'<tr>{"".join(f"<td>{escape(cell)}</td>" for cell in row)}</tr>' for row in rows]
-    return f'<table>{"".join(lines)}</table>'
 
 
 def _node_row(node: NodeSummary) -> tuple[str, ...]:

@@ -50,7 +50,8 @@ def find_bags(patterns: Iterable[str], folder: Path) -> list[StudyBag]:
 
 def _bags_by(pattern: str, folder: Path) -> list[Path]:
     whole = folder / Path(pattern).expanduser()
-    matches = [Path(match) for match in sorted(glob.glob(str(whole), recursive=True))]
+    # Path.glob takes no absolute pattern.
+    matches = [Path(match) for match in sorted(glob.glob(str(whole), recursive=True))]  # noqa: PTH207
     if whole.exists() and not matches:  # a name with brackets is a name, too
         matches = [whole]
     bags = [bag for match in matches if match.is_dir() for bag in _bags_below(match)]
@@ -69,9 +70,7 @@ def _bags_below(folder: Path) -> list[Path]:
     """Return a folder if it is a bag, else all bags anywhere below it."""
     if _is_bag(folder):
         return [folder]
-    return [
-        bag for part in sorted(folder.iterdir()) if part.is_dir() for bag in _bags_below(part)
-    ]
+    return [bag for part in sorted(folder.iterdir()) if part.is_dir() for bag in _bags_below(part)]
 
 
 def _is_bag(folder: Path) -> bool:

@@ -46,9 +46,7 @@ class Setting:
         """The changes in a few words."""
         if not self.number:
             return 'as recorded'
-        words = (
-            f'{key.rpartition(".")[2]}={_short(value)}' for key, value in self.changes.items()
-        )
+        words = (f'{key.rpartition(".")[2]}={_short(value)}' for key, value in self.changes.items())
         return ', '.join(words) or 'unchanged'
 
 

@@ -78,6 +78,7 @@ class Result:
         cpu: processor time of the row [s], without the warm-up of a new worker.
         warm_up: processor time of that [s]; 0 for all but its first row.
         memory: largest resident memory of the worker so far [bytes].
+        lost: no worker has computed it, for a reason that is not that of bag or setting.
     """
 
     outputs: dict[str, float]
@@ -87,6 +88,7 @@ class Result:
     cpu: float
     warm_up: float
     memory: int
+    lost: bool = False
 
 
 class OtherCodeError(RuntimeError):
