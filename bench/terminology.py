@@ -15,6 +15,7 @@ ROOMS = (
     'viewer',
     'session',
     'recordings',
+    'studies',
     'mesh_import',
     'cli',
     'bench',

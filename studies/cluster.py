@@ -91,7 +91,7 @@ def check_versions(client: Client, address: str) -> None:
     Raises:
         SessionError: the first difference.
     """
-    versions = client.get_versions()
+    versions: Any = client.get_versions()
     mine = versions['client']['packages']
     others = {'the scheduler': versions['scheduler'], **versions['workers']}
     for name, theirs in others.items():

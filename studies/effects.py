@@ -52,7 +52,7 @@ class Effect:
     @property
     def is_zero(self) -> bool:
         """Whether no bag shows a change."""
-        return self.mean == self.low == self.high == 0.0
+        return self.mean == 0.0 and not (self.low < 0.0 or self.high > 0.0)
 
 
 def effects_of_settings(

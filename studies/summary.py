@@ -34,6 +34,8 @@ _MAX_PANELS = 6
 _MAX_CAUSES = 16
 """Settings of the plot; with more of them it shows the keys."""
 _MAX_REASONS = 10
+_ROUNDING = 1e-9
+"""Share of an effect below which the end of its interval is shown as 0."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,10 @@ def _cells(effect: Effect) -> tuple[str, ...]:
     unit = OUTPUTS[effect.output].unit
     name = f'{effect.output} [{unit}]' if unit else effect.output
     reference = '' if np.isnan(effect.reference) else f'{effect.reference:.4g}'
-    ends = 'one bag' if np.isnan(effect.low) else f'{effect.low:+.3g} to {effect.high:+.3g}'
+    low, high = (
+        0.0 if abs(e) < _ROUNDING * abs(effect.mean) else e for e in (effect.low, effect.high)
+    )
+    ends = 'one bag' if np.isnan(effect.low) else f'{low:+.3g} to {high:+.3g}'
     return name, effect.cause, reference, f'{effect.mean:+.3g}', ends, str(effect.bags)
 
 
