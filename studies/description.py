@@ -35,22 +35,24 @@ def _scene_key(key: str) -> str:
     if section not in MODELS:
         if section in SECTIONS:
             raise ValueError(
-                f'{key}: section {section} moves an emulated arm, and a study has recorded hands: '
+                f'section {section} moves an emulated arm, and a study has recorded hands: '
                 f'change {", ".join(MODELS)}'
             )
         near = nearest(section, MODELS)
         hint = f'did you mean {near}?' if near else f'known are {", ".join(MODELS)}'
-        raise ValueError(f'{key}: {section} is not a section of a scene: {hint}')
+        raise ValueError(f'{section} is not a section of a scene: {hint}')
     if not path:
-        raise ValueError(f'{key}: give section and key, as in tissue.material.toughness')
+        raise ValueError('give section and key, as in tissue.material.toughness')
     models: list[type[BaseModel]] = [MODELS[section]]
     for part in path:
         fields = [m.model_fields[part] for m in models if part in m.model_fields]
         if not fields:
             known = list(dict.fromkeys(name for m in models for name in m.model_fields))
+            if not known:
+                raise ValueError(f'{part} is not a key of a scene: the key before it has a value')
             near = nearest(part, known)
-            hint = f'did you mean {near}?' if near else f'known are {", ".join(known) or "none"}'
-            raise ValueError(f'{key}: {part} is not a key of a scene there: {hint}')
+            hint = f'did you mean {near}?' if near else f'known are {", ".join(known)}'
+            raise ValueError(f'{part} is not a key of a scene there: {hint}')
         models = [inner for field in fields for inner in models_in(field.annotation)]
     return key
 
