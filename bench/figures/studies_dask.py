@@ -160,7 +160,6 @@ def _scheduler(folder: Path) -> Iterator[str]:
             time.sleep(0.05)
         yield json.loads(file.read_text())['address']
     finally:
-        for process in reversed(started):
-            process.terminate()
-        for process in started:
+        for process in started:  # a worker may wait for the scheduler, which has ended before it
+            process.kill()
             process.wait()
