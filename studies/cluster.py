@@ -86,7 +86,8 @@ def others_cluster(address: str) -> Iterator[Client]:
 
 
 def check_versions(client: Client, address: str) -> None:
-    """Refuse a scheduler or worker whose Dask or trainer is another one than here.
+    """Refuse a scheduler or worker whose Dask or trainer is another one than here, or that has
+    several threads.
 
     Raises:
         SessionError: the first difference.
@@ -102,6 +103,12 @@ def check_versions(client: Client, address: str) -> None:
                     f'{theirs["packages"].get(package)}, and here is {mine[package]}: install the '
                     'same (requirements-study-lock.txt)'
                 )
+    for name, threads in client.nthreads().items():
+        if threads > 1:  # threads load kernels in an order of chance, and share one Python
+            raise SessionError(
+                f'--scheduler {address}: worker {name} has {threads} threads: start workers with '
+                '--nthreads 1, and more of them'
+            )
     here = identity_of_worker()
     for name, found in client.run(identity_of_worker, on_error='return').items():
         if not isinstance(found, Identity):

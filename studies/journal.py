@@ -41,12 +41,22 @@ class Journal:
     _descriptor: int
 
     def append(self, key: Key, result: Result) -> None:
-        """Write a row, and wait until it is on disk."""
+        """Write a row, and wait until it is on disk.
+
+        Raises:
+            SessionError: it cannot be written.
+        """
         line = json.dumps({'key': key, **asdict(result)}) + '\n'
         data = memoryview(line.encode())
-        while data:
-            data = data[os.write(self._descriptor, data) :]
-        os.fsync(self._descriptor)
+        try:
+            while data:
+                data = data[os.write(self._descriptor, data) :]
+            os.fsync(self._descriptor)
+        except OSError as error:
+            raise SessionError(
+                f'{self.path} cannot be written ({error.strerror}): make room, and start the study '
+                'again; it goes on with what is left'
+            ) from None
         self.rows[key] = result
 
 

@@ -1,6 +1,7 @@
 """Studies without their workers: files, settings, bags, journal, effects."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings, interval
 from cutting_trainer.studies.evaluation import Result
 from cutting_trainer.studies.identity import identity_of_worker
-from cutting_trainer.studies.journal import JOURNAL_FILE, key_of, open_journal
+from cutting_trainer.studies.journal import JOURNAL_FILE, Journal, key_of, open_journal
 from cutting_trainer.studies.outputs import OUTPUTS
 from cutting_trainer.studies.summary import as_text, summarise, write_page
 from cutting_trainer.studies.table import Row, write_table
@@ -153,6 +154,15 @@ def test_rows_are_read_back_and_those_of_other_code_or_cut_off_are_not(tmp_path:
         open_journal(tmp_path, here) as _,
     ):
         pass
+
+
+def test_full_disk_gives_one_sentence() -> None:
+    full = os.open('/dev/full', os.O_WRONLY)
+    journal = Journal(Path('rows.jsonl'), {}, 0, full)
+    with pytest.raises(SessionError, match=r'No space left on device\): make room'):
+        journal.append(('a', ''), result(1.0))
+    os.close(full)
+    assert not journal.rows
 
 
 def bags(count: int) -> list[StudyBag]:

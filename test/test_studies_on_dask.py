@@ -10,6 +10,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -17,7 +19,7 @@ from distributed import Client, LocalCluster
 
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
-from cutting_trainer.studies.cluster import compute, others_cluster, own_cluster
+from cutting_trainer.studies.cluster import check_versions, compute, others_cluster, own_cluster
 from cutting_trainer.studies.designs import RECORDED, Setting
 from cutting_trainer.studies.evaluation import Job
 from cutting_trainer.studies.identity import identity_of_worker
@@ -201,6 +203,38 @@ def test_scheduler_that_does_not_answer_is_named() -> None:
         others_cluster('nothing://there'),
     ):
         pass
+
+
+def test_worker_of_others_with_several_threads_is_refused(client: Client) -> None:
+    with others_cluster(client.scheduler.address) as another:
+        assert another.nthreads() == client.nthreads()
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None,
+                     ) as cluster,
+        pytest.raises(SessionError, match='has 2 threads: start workers with --nthreads 1'),
+        others_cluster(cluster.scheduler_address),
+    ):  # fmt: skip
+        pass
+
+
+@pytest.mark.parametrize(
+    ('dask', 'found', 'said'),
+    [
+        ('1', replace(identity_of_worker(), code='0'), 'other code: code is 0 on the worker'),
+        ('1', ModuleNotFoundError('no cutting_trainer'), 'cannot import the trainer.*: start it'),
+        ('2', identity_of_worker(), 'tcp://w has dask 2, and here is 1: install the same'),
+    ],
+)
+def test_worker_of_others_with_other_code_is_refused(dask: str, found: object, said: str) -> None:
+    mine, theirs = ({'packages': {'dask': d, 'distributed': '1'}} for d in ('1', dask))
+    versions = {'client': mine, 'scheduler': mine, 'workers': {'tcp://w': theirs}}
+    world: Any = SimpleNamespace(
+        get_versions=lambda: versions,
+        nthreads=lambda: {'tcp://w': 1},
+        run=lambda function, on_error: {'tcp://w': found},
+    )
+    with pytest.raises(SessionError, match=said):
+        check_versions(world, 'tcp://s')
 
 
 def test_worker_that_takes_too_much_memory_is_ended_and_its_row_says_so(
