@@ -163,13 +163,15 @@ def test_study_that_is_done_starts_no_workers_and_other_outputs_compute_nothing(
 # Workers in this process: the protocol, without computing.
 
 
+IN_PROCESS: Any = {'n_workers': 1, 'processes': False, 'dashboard_address': '127.0.0.1:0'}
+
+
 @pytest.fixture(scope='module')
 def client() -> Iterator[Client]:
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None,
-                     ) as cluster,
+        LocalCluster(**IN_PROCESS, threads_per_worker=1) as cluster,
         Client(cluster) as client,
-    ):  # fmt: skip
+    ):
         yield client
 
 
@@ -209,11 +211,10 @@ def test_worker_of_others_with_several_threads_is_refused(client: Client) -> Non
     with others_cluster(client.scheduler.address) as another:
         assert another.nthreads() == client.nthreads()
     with (
-        LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None,
-                     ) as cluster,
+        LocalCluster(**IN_PROCESS, threads_per_worker=2) as cluster,
         pytest.raises(SessionError, match='has 2 threads: start workers with --nthreads 1'),
         others_cluster(cluster.scheduler_address),
-    ):  # fmt: skip
+    ):
         pass
 
 
