@@ -8,7 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import dask
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster, Status, as_completed
+from distributed.compatibility import PeriodicCallback
 
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies.evaluation import Job, Result, evaluate
@@ -19,6 +20,9 @@ MAX_DEATHS = 5
 MAX_MEMORY_BYTES = 4 * 10**9
 """Memory of an own worker, above which it is killed; it has its share of the machine's, if less."""
 WORKERS_TIMEOUT_S = 60.0
+_LOST_TIMEOUT_S = 60.0
+"""Time for a killed worker to be back, after which it is replaced."""
+_RESTORING_PERIOD_MS = 2000.0
 _MIN_WAITING = 16
 _PER_THREAD = 2
 """Rows that wait at the scheduler for each thread of the workers; the rest waits here."""
@@ -34,6 +38,7 @@ def own_cluster(workers: int) -> Iterator[Client]:
         {
             'distributed.scheduler.allowed-failures': MAX_DEATHS,
             'distributed.scheduler.worker-saturation': 1.0,
+            'distributed.deploy.lost-worker-timeout': f'{_LOST_TIMEOUT_S:.0f} s',
         }
     ):
         memory = min(MAX_MEMORY_BYTES, int(_machine_memory() / workers))
@@ -49,7 +54,21 @@ def own_cluster(workers: int) -> Iterator[Client]:
             ) as cluster,
             Client(cluster) as client,
         ):
-            yield client
+            restoring = PeriodicCallback(lambda: restore_workers(cluster), _RESTORING_PERIOD_MS)
+            client.loop.add_callback(restoring.start)
+            try:
+                yield client
+            finally:
+                client.loop.add_callback(restoring.stop)
+
+
+def restore_workers(cluster: Any) -> None:
+    """Start workers anew that Dask has given up: those killed again before they were ready."""
+    ended = (Status.closed, Status.failed)
+    for name in [name for name, nanny in cluster.workers.items() if nanny.status in ended]:
+        del cluster.workers[name]
+    if set(cluster.worker_spec) - set(cluster.workers):
+        cluster.scale(len(cluster.worker_spec))
 
 
 def _machine_memory() -> int:

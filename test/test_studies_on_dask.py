@@ -238,6 +238,18 @@ def test_worker_of_others_with_other_code_is_refused(dask: str, found: object, s
         check_versions(world, 'tcp://s')
 
 
+def test_worker_that_dask_gives_up_is_started_anew() -> None:
+    # It does so where a worker is killed again before it is back: such a study had no end.
+    with own_cluster(1) as client:
+        (before,) = client.nthreads()
+        nanny = client.cluster.workers[0]
+        client.sync(nanny.close)
+        until = time.monotonic() + _TIMEOUT_S
+        while not client.nthreads() or before in client.nthreads():
+            assert time.monotonic() < until, 'there is no worker any more'
+            time.sleep(0.1)
+
+
 def test_worker_that_takes_too_much_memory_is_ended_and_its_row_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
