@@ -9,7 +9,7 @@ from typing import Any
 
 import dask
 from distributed import Client, KilledWorker, LocalCluster, Status, as_completed
-from distributed.compatibility import PeriodicCallback
+from tornado.ioloop import PeriodicCallback
 
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies.evaluation import Job, Result, evaluate

@@ -175,6 +175,7 @@ def effects_figure(summary: StudySummary) -> Figure | None:
         )
         unit = f' [{OUTPUTS[output].unit}]' if OUTPUTS[output].unit else ''
         axes.set(xlabel=f'{output}{unit}', ylim=(len(names) - 0.5, -0.5))
+        axes.locator_params(axis='x', nbins=5)
         axes.set_yticks(range(len(names)), names)
     return figure
 

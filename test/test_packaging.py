@@ -124,7 +124,9 @@ def imported_by(folder: str) -> set[str]:
 def test_every_library_that_a_room_imports_is_pinned_for_run_time(room: str) -> None:
     # the mesher is an extra: it has no wheels for every machine
     # and Dask is installed before the first study
-    extra = {'mesh_import': {'pytetwild'}, 'studies': {'dask', 'distributed'}}.get(room, set())
+    extra = {'mesh_import': {'pytetwild'}, 'studies': {'dask', 'distributed', 'tornado'}}.get(
+        room, set()
+    )
     assert imported_by(room) <= pins('requirements.txt').keys() | extra
 
 
