@@ -45,7 +45,7 @@ def own_cluster(workers: int) -> Iterator[Client]:
         logging.getLogger('distributed').setLevel(logging.CRITICAL)
         with (
             LocalCluster(
-                n_workers=workers,
+                n_workers=0,  # a worker killed as it starts would end the whole cluster
                 threads_per_worker=1,
                 memory_limit=memory,
                 host='127.0.0.1',
@@ -57,9 +57,27 @@ def own_cluster(workers: int) -> Iterator[Client]:
             restoring = PeriodicCallback(lambda: restore_workers(cluster), _RESTORING_PERIOD_MS)
             client.loop.add_callback(restoring.start)
             try:
+                cluster.scale(workers)
+                _wait_for_own(client, workers)
                 yield client
             finally:
                 client.loop.add_callback(restoring.stop)
+
+
+def _wait_for_own(client: Client, workers: int) -> None:
+    """Wait until all workers are ready, or go on with those that are after some time.
+
+    Raises:
+        SessionError: there is none.
+    """
+    try:
+        client.wait_for_workers(workers, timeout=WORKERS_TIMEOUT_S)
+    except TimeoutError:
+        if not client.nthreads():
+            raise SessionError(
+                f'no worker has started in {WORKERS_TIMEOUT_S:.0f} s: free memory, or try '
+                '--workers 1'
+            ) from None
 
 
 def restore_workers(cluster: Any) -> None:

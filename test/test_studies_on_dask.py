@@ -40,7 +40,7 @@ settings:
       tissue.material.poissons_ratio: 0.7
 """
 ROWS = 9
-_TIMEOUT_S = 120.0
+_TIMEOUT_S = 300.0
 
 
 @pytest.fixture(scope='module')
