@@ -37,6 +37,9 @@ setup(
     package_data={'cutting_trainer.viewer': ['static/*', 'static/*/*']},
     data_files=data_files(),
     install_requires=at_least('requirements.txt'),
-    extras_require={'mesh': at_least('requirements-mesh.txt')},
+    extras_require={
+        'mesh': at_least('requirements-mesh.txt'),
+        'study': at_least('requirements-study.txt'),
+    },
     entry_points={'console_scripts': ['cutting-trainer = cutting_trainer.cli.main:main']},
 )

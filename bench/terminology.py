@@ -16,6 +16,7 @@ ROOMS = (
     'viewer',
     'session',
     'recordings',
+    'studies',
     'mesh_import',
     'cli',
     'bench',

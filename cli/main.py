@@ -9,7 +9,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from cutting_trainer.cli import bag_commands, session_commands, two_host_commands, user_commands
+from cutting_trainer.cli import (
+    bag_commands,
+    session_commands,
+    study_commands,
+    two_host_commands,
+    user_commands,
+)
 from cutting_trainer.cli.options import EXIT_STATUSES
 from cutting_trainer.session.exit_status import Status
 
@@ -22,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode='markdown',
 )
-for group in (session_commands, two_host_commands, bag_commands, user_commands):
+for group in (session_commands, two_host_commands, bag_commands, study_commands, user_commands):
     app.add_typer(group.commands)
 
 

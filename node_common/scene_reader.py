@@ -96,6 +96,28 @@ def read_section(path: Path, section: str, model: type[M], tool: str = '') -> M:
         raise SceneError(_most_helpful(place, error.errors())) from None
 
 
+def read_document(path: Path, model: type[M], kind: str) -> M:
+    """Read and check a whole file of another kind than a scene, by one model.
+
+    Args:
+        path: the file.
+        model: model of the file, preferably derived from `SceneModel`.
+        kind: name of its kind for messages, as in `study`.
+
+    Raises:
+        SceneError: one sentence with file, line, key, value and remedy.
+    """
+    root, document = _read(path, kind, tuple(model.model_fields))
+    try:
+        return model.model_validate_json(
+            json.dumps(document, default=str),
+            strict=True,
+            context={'folder': path.parent.resolve()},
+        )
+    except ValidationError as error:
+        raise SceneError(_most_helpful(_Place(path, '', root, model), error.errors())) from None
+
+
 def tool_names(path: Path) -> tuple[str, ...]:
     """Return the names of the further tools of a scene, in their order; (): it has one tool.
 
@@ -151,17 +173,19 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def _read(path: Path) -> tuple[MappingNode, dict[str, Any]]:
-    """Return the nodes and the plain values of a scene file."""
+def _read(
+    path: Path, kind: str = 'scene', known: tuple[str, ...] = SECTIONS
+) -> tuple[MappingNode, dict[str, Any]]:
+    """Return the nodes and the plain values of a file of a kind, whose sections are known."""
     if not path.is_file():
-        raise SceneError(f'scene file {missing_file(path)}')
+        raise SceneError(f'{kind} file {missing_file(path)}')
     try:
-        return _parsed(path, read_bounded(path))
+        return _parsed(path, read_bounded(path), kind, known)
     except YamlBoundError as error:
         raise SceneError(error.of(path)) from None
     except UnicodeDecodeError as error:
         raise SceneError(
-            f'{path}: byte {error.start} is not UTF-8 text: a scene is a YAML file'
+            f'{path}: byte {error.start} is not UTF-8 text: a {kind} is a YAML file'
         ) from None
     except OSError as error:
         raise SceneError(f'{path} cannot be read: {error.strerror}') from None
@@ -170,17 +194,20 @@ def _read(path: Path) -> tuple[MappingNode, dict[str, Any]]:
 
 
 @functools.lru_cache(maxsize=8)  # a scene is read once for each of its sections
-def _parsed(path: Path, text: str) -> tuple[MappingNode, dict[str, Any]]:
-    """Return the nodes and the plain values of the text of a scene; nobody changes them."""
+def _parsed(
+    path: Path, text: str, kind: str, known: tuple[str, ...]
+) -> tuple[MappingNode, dict[str, Any]]:
+    """Return the nodes and the plain values of the text of a file; nobody changes them."""
     check_yaml(text)
     root = YAML(typ='safe', pure=True).compose(text)
-    expected = f'a scene is a mapping of the sections {", ".join(SECTIONS)}'
+    expected = f'a {kind} is a mapping of the sections {", ".join(known)}'
     if root is None:
         raise SceneError(f'{path} is empty: {expected}')
     if not isinstance(root, MappingNode):
         raise SceneError(f'{path}:{_line(root)}: the file is a {_kind(root)}: {expected}')
     document = _plain(root, path, ())
-    _check_sections(root, path)
+    if kind == 'scene':
+        _check_sections(root, path)
     return root, document
 
 
@@ -330,7 +357,7 @@ class _Place:
 
         Parts of `loc` that name a model are skipped.
         """
-        node, line, keys = self.node, _line(self.node), [self.section]
+        node, line, keys = self.node, _line(self.node), [self.section] if self.section else []
         for part in loc:
             found = _key_and_value(node, part)
             if found is not None:
@@ -342,7 +369,7 @@ class _Place:
         line, keys = self.locate(error['loc'])
         models, field = _described(self.model, error['loc'])
         about = f' ({field.description})' if field is not None and field.description else ''
-        head = f'{self.path}:{line}: {_dotted(keys)}'
+        head = f'{self.path}:{line}: {_dotted(keys) or "the file"}'
         if error['type'] == 'missing':
             return f'{head} is {_short(error["input"])}: {error["loc"][-1]} is missing{about}'
         if error['type'] == 'extra_forbidden':
@@ -384,16 +411,17 @@ def _described(
             models = narrowed or models
             continue
         field = fields[0]
-        inner = [m for f in fields for m in _models_in(f.annotation)]
+        inner = [m for f in fields for m in models_in(f.annotation)]
         if i + 1 < len(loc):
             models = inner or models
     return models, field
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models within the type of a field."""
     if isinstance(annotation, types.GenericAlias) or typing.get_origin(annotation) is not None:
         for argument in typing.get_args(annotation):
-            yield from _models_in(argument)
+            yield from models_in(argument)
     elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
 

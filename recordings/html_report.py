@@ -1,7 +1,5 @@
 """`trainer report`: a session on one page, for trainee and teacher."""
 
-import base64
-import io
 import math
 import tempfile
 from datetime import UTC, datetime
@@ -36,6 +34,7 @@ from cutting_trainer.node_common.cdr_codec import (
     PoseStampedCodec,
     WrenchStampedCodec,
 )
+from cutting_trainer.recordings.html_page import image, page, table
 from cutting_trainer.recordings.incision_metrics import (
     distance_to_paths,
     extent,
@@ -59,19 +58,6 @@ _SAMPLE_STRIDE = 20
 """Every 20th contact is a sample of depth and speed: 20 ms."""
 _MAX_PEAKS = 5
 _MIN_PEAK_DISTANCE_S = 0.5  # [s]
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{font: 16px/1.45 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
-  color: #222}}
-h1 {{font-size: 1.5rem}} h2 {{font-size: 1.15rem; margin-top: 2rem}}
-table {{border-collapse: collapse}}
-td, th {{padding: .15rem .8rem .15rem 0; text-align: left; border-bottom: 1px solid #ddd}}
-td + td, th + th {{text-align: right}} img {{max-width: 100%}}
-figcaption, .note {{color: #555; font-size: .9rem}} figure {{margin: 1rem 0}}
-</style></head><body>
-{body}
-</body></html>
-"""
 
 
 def write_report(folder: Path, file: Path) -> Summary:
@@ -98,7 +84,7 @@ def write_report(folder: Path, file: Path) -> Summary:
     with mpl.rc_context(STYLE):
         body = _body(bag, story, before, summary, scene)
     title = f'Session {folder.resolve().name}'
-    file.write_text(_PAGE.format(title=escape(title), body=body), encoding='utf-8')
+    file.write_text(page(title, body), encoding='utf-8')
     return summary
 
 
@@ -138,23 +124,23 @@ def _body(
     parts = [
         f'<h1>Session {escape(Path(summary.bag).resolve().name)}</h1>',
         f'<p class="note">{begun:%Y-%m-%d %H:%M:%S} UTC, {summary.duration:.1f} s; {about}</p>',
-        _table(_numbers(story, summary, depth)),
+        table(_numbers(story, summary, depth)),
         *_exercise(bag, scene),
         '<h2>The cut</h2>',
-        _table(_cut_numbers(bag, story, depth, tool, script)),
+        table(_cut_numbers(bag, story, depth, tool, script)),
         *_further_tools(bag),
-        _image(_path_figure(story, script), 'Path of the tip from above, and the plan.'),
+        image(_path_figure(story, script), 'Path of the tip from above, and the plan.'),
         '<h2>Force, depth, speed</h2>',
-        _image(
+        image(
             _time_figure(story, tool, depth, hand_speed(bag)),
             "Grey: contact; red: the blade is in the tissue. Depth is that of the blade's end "
             'under the surface at rest. Marked are the largest peaks of the force.',
         ),
-        _table(_peaks(story), ('peak at [s]', 'force [N]', 'while')),
+        table(_peaks(story), ('peak at [s]', 'force [N]', 'while')),
         '<h2>Tissue before and after</h2>',
-        _image(_tissue_figure(story, before), 'Dark red: cut faces.'),
+        image(_tissue_figure(story, before), 'Dark red: cut faces.'),
         '<h2>Rates</h2>',
-        _table(
+        table(
             [_node_row(node) for node in summary.nodes.values() if not math.isnan(node.rate)],
             ('node', 'rate / lowest [Hz]', 'in time [%]', 'period p99 / worst [ms]', 'missed'),
         ),
@@ -188,7 +174,7 @@ def _exercise(bag: Bag, scene: Scene | None) -> list[str]:
     ]
     return [
         f'<h2>{escape(scene.exercise.title)}: {verdict} with {got.points:.0f} points</h2>',
-        _table(rows, ('measure', 'value', 'points')),
+        table(rows, ('measure', 'value', 'points')),
         ''.join(f'<p class="note">{escape(reason)}</p>' for reason in got.reasons),
     ]
 
@@ -241,7 +227,7 @@ def _further_tools(bag: Bag) -> list[str]:
     if not rows:
         return []
     head = ('tool', 'contact [s]', 'holds the tissue, or is in it [s]', 'largest force [N]')
-    return ['<h2>The other tools</h2>', _table(rows, head)]
+    return ['<h2>The other tools</h2>', table(rows, head)]
 
 
 def incision_area(bag: Bag) -> float:
@@ -360,23 +346,6 @@ def _tissue_figure(story: Story, before: MeshReplica) -> Figure:
     draw_tissue(left, Story(replica=before, moment=first))
     draw_tissue(right, Story(replica=story.replica, moment=story.moment))
     return figure
-
-
-def _image(figure: Figure, caption: str) -> str:
-    out = io.BytesIO()
-    figure.savefig(out, format='png', dpi=110)
-    text = base64.b64encode(out.getvalue()).decode()
-    said = escape(caption)
-    return (
-        f'<figure><img alt="{said}" src="data:image/png;base64,{text}">'
-        f'<figcaption>{said}</figcaption></figure>'
-    )
-
-
-def _table(rows: list[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
-    lines = [f'<tr>{"".join(f"<th>{escape(cell)}</th>" for cell in head)}</tr>'] if head else []
-    lines += [f'<tr>{"".join(f"<td>{escape(cell)}</td>" for cell in row)}</tr>' for row in rows]
-    return f'<table>{"".join(lines)}</table>'
 
 
 def _node_row(node: NodeSummary) -> tuple[str, ...]:

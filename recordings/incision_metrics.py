@@ -6,11 +6,12 @@ from numpy.typing import NDArray
 from cutting_trainer.exercises.opened_tissue import distance_to_line
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ScriptSettings
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 
 Floats = NDArray[np.float64]
 
 
-def surface_length(tissue: MeshReplica) -> float:
+def surface_length(tissue: MeshReplica | TetMesh) -> float:
     """Return the length of the incision on the surface, at rest [m].
 
     It is half of the length of all edges between the outer surface and cut faces, because each edge

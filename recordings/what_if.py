@@ -186,6 +186,21 @@ class Hand:
         self.ticks.append((now, self.path.force_norm, self.path.contact != NONE))
 
 
+@dataclass(frozen=True)
+class RecordedForce:
+    """Force on the hand as recorded, in answer to each pose.
+
+    Attributes:
+        times: stamps of the poses [ns], shape (n,).
+        forces: norm of the force on the hand [N], shape (n,).
+        contact: contact flag, shape (n,).
+    """
+
+    times: np.ndarray
+    forces: np.ndarray
+    contact: np.ndarray
+
+
 def run_experiment(bag: Bag, scene: Scene, computed: Resimulation) -> Run:
     """Compute a session from the poses of its device.
 
@@ -197,8 +212,22 @@ def run_experiment(bag: Bag, scene: Scene, computed: Resimulation) -> Run:
     Raises:
         SessionError: the bag has no poses, or the changed session ends in a FAULT.
     """
-    records, poses = computable_poses(bag)
-    hand = Hand(make_force_path(scene), indexings=deque(recorded_indexings(bag)))
+    return move_hand(*computable_poses(bag), recorded_indexings(bag), scene, computed)
+
+
+def move_hand(
+    records: Sequence[FrameRecord],
+    poses: Sequence[StampedMessage],
+    indexings: Sequence[Indexing],
+    scene: Scene,
+    computed: Resimulation,
+) -> Run:
+    """Compute a session from frames, poses and indexings already read, as `run_experiment` does.
+
+    Raises:
+        SessionError: the changed session ends in a FAULT.
+    """
+    hand = Hand(make_force_path(scene), indexings=deque(indexings))
     untils = (hand.follow(record) for record in records)
     computed.answer_frames = answer_frames(records)
     for _ in closed_loop(poses, untils, hand, computed):
@@ -222,18 +251,39 @@ def recorded_run(bag: Bag, computed: Resimulation) -> tuple[Run, int | None]:
         BagError: a frame cannot be recomputed.
         SessionError: the bag has no poses, or no forces of the hand.
     """
-    (records, poses), differs = computable_poses(bag), None
+    records, poses = computable_poses(bag)
+    return recompute(records, recorded_force(bag, poses), computed)
+
+
+def recompute(
+    records: Sequence[FrameRecord], felt: RecordedForce, computed: Resimulation
+) -> tuple[Run, int | None]:
+    """Recompute the tissue under frames already read, as `recorded_run` does.
+
+    Raises:
+        BagError: a frame cannot be recomputed.
+    """
+    differs = None
     place = ForceSampleCodec.fields['force']
     for record, frame in zip(records, as_recorded(records, computed), strict=True):
         was = frame.force if record.force is None else np.array(record.force.values[place])
         off = float(np.abs(frame.force - was).max())
         if differs is None and off > MAX_ROUNDING * np.abs(was).max():
             differs = record.step
+    return _run(felt.times, felt.forces, felt.contact, computed), differs
+
+
+def recorded_force(bag: Bag, poses: Sequence[StampedMessage]) -> RecordedForce:
+    """Return the recorded force on the hand in answer to its poses.
+
+    Raises:
+        SessionError: the bag has no forces of the hand, or no contacts.
+    """
     state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
     times = np.array([pose.stamp_ns for pose in poses])
     touched = _at(bag, CONTACT, ContactCodec(), times)[:, state].ravel() != NONE
     forces = np.linalg.norm(_at(bag, SERVO_CF, WrenchStampedCodec(), times)[:, force], axis=1)
-    return _run(times, forces, touched, computed), differs
+    return RecordedForce(times, forces, touched)
 
 
 def _run(times: np.ndarray, forces: np.ndarray, contact: np.ndarray, computed: Resimulation) -> Run:

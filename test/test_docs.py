@@ -87,7 +87,8 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 def test_every_file_that_a_document_names_is_there(page: Path) -> None:
     folders = (
-        r'(?:node_common|tissue_sim|haptic_bridge|cutting|bags|viewer|session|recordings|mesh_import|'
+        r'(?:node_common|tissue_sim|haptic_bridge|cutting|bags|viewer|session|recordings|studies|'
+        r'mesh_import|'
         r'cli|bench|config|launch|msg_defs|docs|test)'
     )
     for name in re.findall(rf'`({folders}/[\w./-]*\w\.(?:py|md|yaml|xml|msg|srv))`', TEXTS[page]):

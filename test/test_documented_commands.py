@@ -116,6 +116,7 @@ SERVED_ALIKE = (
 """Of these, what test_view_replay.py and test_resimulation.py claim without a process."""
 COMPUTED_ALIKE = tuple(command for command in HERE if ' --with ' in command)
 """Of `HERE`, what test_resimulation.py claims of other changes."""
+SCHEDULER = Nowhere('`python -m bench.figures studies` starts them with a free port')
 DRIVES = Elsewhere(
     'test_integrate.py::test_example_that_drives_the_tool_presses_and_follows_the_mesh',
     ('../session/node_commands.py',),
@@ -163,6 +164,16 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
             ' --delete SUBJECT',
         )
     },
+    'for s in 6 7 8 9 10 11 12 13 14 15; do ./trainer demo --scene '
+    'bags/samples/straight_cut.yaml --seconds $s --bag bags/sessions/study/cut_$s; done': Nowhere(
+        'takes minutes: other sessions are recorded here'
+    ),
+    './trainer study config/studies/toughness.yaml -o bags/sessions/toughness': Nowhere(
+        'takes a minute, and ten bags: test_studies_on_dask.py computes another study'
+    ),
+    './trainer run dask scheduler': SCHEDULER,
+    './trainer run dask worker tcp://HOST:8786 --nthreads 1': SCHEDULER,
+    './trainer study config/studies/toughness.yaml --scheduler tcp://HOST:8786': SCHEDULER,
     './trainer clean': Elsewhere('test_launcher.py::test_clean_leaves_nothing_but_the_lock'),
     './trainer record -o BAG --scene block': Elsewhere(
         'test_bags_live.py::'

@@ -89,7 +89,7 @@ def test_help_names_what_there_is_before_anything_is_set_up(tree: Path) -> None:
 def test_command_goes_to_the_module_that_has_it(
     launcher: Any, monkeypatch: pytest.MonkeyPatch, arguments: list[str], module: list[str]
 ) -> None:
-    monkeypatch.setattr(launcher, 'prepare', lambda home, **_: None)
+    monkeypatch.setattr(launcher, 'prepare', lambda home, command: None)
     monkeypatch.setattr(launcher.os, 'execve', lambda file, words, env: words)
     assert launcher.main(arguments)[1:] == ['-m', *module]
 
@@ -349,7 +349,8 @@ def test_nodes_stay_on_this_machine_unless_the_user_says_otherwise(launcher: Any
 
 
 KERNELS = {'compile_kernels', 'compile_further_kernels'}
-ALL = {'make_environment', 'build_interfaces', 'build_overlay'} | KERNELS
+LATER = {'compile_further_kernels', 'install_study_packages'}
+ALL = {'make_environment', 'build_interfaces', 'build_overlay'} | KERNELS | LATER
 
 
 @pytest.fixture
@@ -382,15 +383,18 @@ def test_second_start_does_nothing(launcher: Any, steps: list[str]) -> None:
     assert prepared(launcher, steps) == set()
 
 
-def test_demo_does_not_wait_for_kernels_that_only_other_methods_need(
+def test_demo_does_not_wait_for_kernels_and_packages_that_only_other_commands_need(
     launcher: Any, steps: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(launcher.os, 'execve', lambda *_: 0)
     launcher.main(['demo'])
-    assert set(steps) == ALL - {'compile_further_kernels'}
+    assert set(steps) == ALL - LATER
     steps.clear()
-    launcher.main(['test'])
+    launcher.main(['bench'])
     assert steps == ['compile_further_kernels']
+    steps.clear()
+    launcher.main(['study'])
+    assert steps == ['install_study_packages']
 
 
 def test_each_change_redoes_the_steps_that_depend_on_it(
@@ -403,6 +407,9 @@ def test_each_change_redoes_the_steps_that_depend_on_it(
     kernel = launcher.kernel_files()[0]
     os.utime(kernel, (1, 1))
     assert prepared(launcher, steps) == KERNELS
+    with (tree / 'requirements-study-lock.txt').open('a') as file:
+        file.write('\n# changed\n')
+    assert prepared(launcher, steps) == {'install_study_packages'}
     with (tree / 'requirements-ros.txt').open('a') as file:
         file.write('\n# changed\n')
     assert prepared(launcher, steps) == ALL
@@ -455,6 +462,7 @@ BEFORE = {
     'build_overlay': {'make_environment', 'build_interfaces'},
     'compile_kernels': {'make_environment'},
     'compile_further_kernels': {'make_environment', 'compile_kernels'},
+    'install_study_packages': {'make_environment'},
 }
 
 

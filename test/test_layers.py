@@ -22,6 +22,7 @@ LAYERS = (
     ('viewer',),
     ('session',),
     ('recordings', 'mesh_import'),
+    ('studies',),
     ('cli', '__init__'),  # for people, and for their programs: cutting_trainer/__init__.py
     ('bench',),
 )

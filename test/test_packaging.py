@@ -73,6 +73,7 @@ LISTS = (
     'requirements-ros.txt',
     'requirements-mesh.txt',
     'requirements-test.txt',
+    'requirements-study.txt',
 )
 
 
@@ -88,11 +89,17 @@ def test_every_file_of_the_page_is_installed_with_its_package(tmp_path: Path) ->
 
 @pytest.mark.parametrize('name', LISTS)
 def test_every_pin_is_locked_to_the_same_version_and_has_its_reason(name: str) -> None:
-    locked = pins('requirements-lock.txt')
+    lock = 'study-lock' if name == 'requirements-study.txt' else 'lock'
+    locked = pins(f'requirements-{lock}.txt')
     reasons = (ROOT / 'docs' / 'dependencies.md').read_text().lower()
     for package, version in pins(name).items():
         assert locked[package] == version
         assert f'`{package}`' in reasons, f'{package} has no reason in docs/dependencies.md'
+
+
+def test_packages_of_studies_have_the_versions_of_all_others() -> None:
+    shared, studies = pins('requirements-lock.txt'), pins('requirements-study-lock.txt')
+    assert all(shared.get(name, version) == version for name, version in studies.items())
 
 
 def imported_by(folder: str) -> set[str]:
@@ -116,7 +123,10 @@ def imported_by(folder: str) -> set[str]:
 @pytest.mark.parametrize('room', ROOMS)
 def test_every_library_that_a_room_imports_is_pinned_for_run_time(room: str) -> None:
     # the mesher is an extra: it has no wheels for every machine
-    extra = {'pytetwild'} if room == 'mesh_import' else set()
+    # and Dask is installed before the first study
+    extra = {'mesh_import': {'pytetwild'}, 'studies': {'dask', 'distributed', 'tornado'}}.get(
+        room, set()
+    )
     assert imported_by(room) <= pins('requirements.txt').keys() | extra
 
 
@@ -128,7 +138,8 @@ def test_no_library_is_installed_with_the_product_that_only_the_checkout_needs()
 @pytest.mark.parametrize('folder', ['test', 'bench'])
 def test_every_library_that_tests_and_measurements_import_is_pinned(folder: str) -> None:
     peers = {'mujoco', 'newton', 'warp'} if folder == 'bench' else set()  # optional, their own list
-    known = {*pins('requirements.txt'), *pins('requirements-test.txt'), *peers}
+    lists = ('requirements.txt', 'requirements-test.txt', 'requirements-study.txt')
+    known = set().union(*map(pins, lists), peers)
     assert imported_by(folder) <= known
 
 
@@ -177,6 +188,7 @@ CORE = (
     'cutting_trainer.bags.comparison',
     'cutting_trainer.session.in_process',
     'cutting_trainer.recordings.resimulate_command',
+    'cutting_trainer.studies.study_command',
     'bench.trials.chaos_verdict',
 )
 

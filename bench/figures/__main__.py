@@ -70,6 +70,16 @@ SUBJECTS = {
             6: 'it needs a reader',
         },
     ),
+    'studies': Subject(
+        modules=('studies_dask',),
+        not_covered={
+            1: 'of it: 20 bags, 10 settings and 20 kills take minutes',
+            2: 'of it: dask-jobqueue is not tried',
+            3: 'tissue is not identified yet',
+            4: 'there is no export for learning yet',
+            5: 'it needs readers who have not seen the code',
+        },
+    ),
     'tissue': Subject(
         modules=('tissue_contact', 'tissue_friction', 'tissue_law', 'tissue_relaxation'),
         not_covered={

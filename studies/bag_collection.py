@@ -1,0 +1,93 @@
+"""Bags of a study, found by path, folder or glob."""
+
+import glob
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cutting_trainer.bags.metadata import METADATA_FILE
+from cutting_trainer.node_common.scene_reader import missing_file
+from cutting_trainer.session.errors import SessionError
+
+_BLOCK_BYTES = 1 << 20
+_HASH_DIGITS = 16
+
+
+@dataclass(frozen=True)
+class StudyBag:
+    """A bag of a study.
+
+    Attributes:
+        name: path as the study file has it, or below the folder that it names.
+        path: absolute path.
+        hash: hash of its content.
+    """
+
+    name: str
+    path: Path
+    hash: str
+
+
+def find_bags(patterns: Iterable[str], folder: Path) -> list[StudyBag]:
+    """Return the bags of a study, each content once, in the order of the patterns.
+
+    Args:
+        patterns: bags, folders with bags anywhere below, or globs.
+        folder: to which relative ones are relative.
+
+    Raises:
+        SessionError: a pattern finds no bag.
+    """
+    found: dict[str, StudyBag] = {}
+    for pattern in patterns:
+        paths = _bags_by(pattern, folder)
+        for path in paths:
+            bag = StudyBag(_name(path, folder), path, hash_of_bag(path))
+            found.setdefault(bag.hash, bag)
+    return list(found.values())
+
+
+def _bags_by(pattern: str, folder: Path) -> list[Path]:
+    whole = folder / Path(pattern).expanduser()
+    # Path.glob takes no absolute pattern.
+    matches = [Path(match) for match in sorted(glob.glob(str(whole), recursive=True))]  # noqa: PTH207
+    if whole.exists() and not matches:  # a name with brackets is a name, too
+        matches = [whole]
+    bags = [bag for match in matches if match.is_dir() for bag in _bags_below(match)]
+    if not bags:
+        if matches:
+            reason = 'there is no bag in it, no folder with metadata.yaml or an .mcap file'
+        elif glob.has_magic(pattern):
+            reason = 'no file matches it'
+        else:
+            reason = missing_file(whole)
+        raise SessionError(f'bags has {pattern!r}, and {reason}')
+    return list(dict.fromkeys(bags))
+
+
+def _bags_below(folder: Path) -> list[Path]:
+    """Return a folder if it is a bag, else all bags anywhere below it."""
+    if _is_bag(folder):
+        return [folder]
+    return [bag for part in sorted(folder.iterdir()) if part.is_dir() for bag in _bags_below(part)]
+
+
+def _is_bag(folder: Path) -> bool:
+    return (folder / METADATA_FILE).is_file() or any(folder.glob('*.mcap'))
+
+
+def _name(path: Path, folder: Path) -> str:
+    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+
+
+def hash_of_bag(folder: Path) -> str:
+    """Return the hash of names and bytes of a bag's files: its metadata and its data."""
+    total = hashlib.sha256()
+    for path in sorted([folder / METADATA_FILE, *folder.glob('*.mcap')]):
+        if path.is_file():
+            total.update(f'{path.name}\0{path.stat().st_size}\0'.encode())
+            with path.open('rb') as file:
+                while block := file.read(_BLOCK_BYTES):
+                    total.update(block)
+    return total.hexdigest()[:_HASH_DIGITS]

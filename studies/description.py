@@ -1,0 +1,161 @@
+"""Study files: bags, settings and outputs, checked as scenes are."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, Field, JsonValue, model_validator
+
+from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.node_common.scene_reader import (
+    SECTIONS,
+    SceneModel,
+    models_in,
+    nearest,
+    read_document,
+)
+from cutting_trainer.studies.outputs import OUTPUTS
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
+
+MAX_SETTINGS = 100_000
+"""Settings of a study; each is computed for each bag."""
+MODELS: dict[str, type[BaseModel]] = {
+    'tissue': TissueSettings,
+    'tool': ToolSettings,
+    'device': DeviceSettings,
+    'haptics': HapticsSettings,
+    'cutting': CuttingSettings,
+}
+"""Sections of a scene that a recorded hand meets. The arm and its script are not among them."""
+
+
+def _scene_key(key: str) -> str:
+    """Return a dotted key of a scene, unchanged; refuse one that no scene has."""
+    section, *path = key.split('.')
+    if section not in MODELS:
+        if section in SECTIONS:
+            raise ValueError(
+                f'section {section} moves an emulated arm, and a study has recorded hands: '
+                f'change {", ".join(MODELS)}'
+            )
+        near = nearest(section, MODELS)
+        hint = f'did you mean {near}?' if near else f'known are {", ".join(MODELS)}'
+        raise ValueError(f'{section} is not a section of a scene: {hint}')
+    if not path:
+        raise ValueError('give section and key, as in tissue.material.toughness')
+    models: list[type[BaseModel]] = [MODELS[section]]
+    for part in path:
+        fields = [m.model_fields[part] for m in models if part in m.model_fields]
+        if not fields:
+            known = list(dict.fromkeys(name for m in models for name in m.model_fields))
+            if not known:
+                raise ValueError(f'{part} is not a key of a scene: the key before it has a value')
+            near = nearest(part, known)
+            hint = f'did you mean {near}?' if near else f'known are {", ".join(known)}'
+            raise ValueError(f'{part} is not a key of a scene there: {hint}')
+        models = [inner for field in fields for inner in models_in(field.annotation)]
+    return key
+
+
+def _output(name: str) -> str:
+    if name not in OUTPUTS:
+        near = nearest(name, OUTPUTS)
+        hint = f'did you mean {near}?' if near else f'known are {", ".join(OUTPUTS)}'
+        raise ValueError(f'{name} is not an output: {hint}')
+    return name
+
+
+SceneKey = Annotated[str, AfterValidator(_scene_key)]
+OutputName = Annotated[str, AfterValidator(_output)]
+
+
+class Range(SceneModel):
+    """Range of a value."""
+
+    low: float = Field(description='smallest value')
+    high: float = Field(description='largest value, above low')
+    scale: Literal['linear', 'log'] = Field(
+        default='linear', description='linear, or log for a range over orders of magnitude'
+    )
+
+    @model_validator(mode='after')
+    def _ordered(self) -> Self:
+        if self.high <= self.low:
+            raise ValueError(f'high is {self.high:g}: it must be above low, {self.low:g}')
+        if self.scale == 'log' and self.low <= 0:
+            raise ValueError(f'low is {self.low:g}: on the scale log it must be above 0')
+        return self
+
+
+class Sampled(SceneModel):
+    """Random settings that fill ranges evenly."""
+
+    samples: int = Field(ge=2, le=MAX_SETTINGS, description='number of settings, from 2')
+    seed: int = Field(default=0, ge=0, lt=2**63, description='seed of the random numbers')
+    ranges: dict[SceneKey, Range] = Field(min_length=1, description='range by dotted scene key')
+
+
+class Sobol(Sampled):
+    """Scrambled Sobol sequence; it is balanced for powers of two only."""
+
+    @model_validator(mode='after')
+    def _balanced(self) -> Self:
+        if self.samples & (self.samples - 1):
+            power = 1 << self.samples.bit_length()
+            raise ValueError(
+                f'samples is {self.samples}: a Sobol sequence is balanced for powers of two, '
+                f'as {power // 2} or {power}'
+            )
+        return self
+
+
+class Designs(SceneModel):
+    """Settings of a study; those of all designs are computed."""
+
+    grid: dict[SceneKey, Annotated[list[JsonValue], Field(min_length=1)]] = Field(
+        default={}, description='values by dotted scene key; each is combined with each'
+    )
+    cases: list[dict[SceneKey, JsonValue]] = Field(
+        default=[], description='settings one by one, each with its values by dotted scene key'
+    )
+    latin_hypercube: Sampled | None = Field(default=None, description='samples, seed, ranges')
+    sobol: Sobol | None = Field(default=None, description='samples, seed, ranges')
+
+    @model_validator(mode='after')
+    def _some(self) -> Self:
+        if not self.model_fields_set:
+            raise ValueError(f'there is no design: give {", ".join(type(self).model_fields)}')
+        size = 1
+        for values in self.grid.values():
+            size *= len(values)
+        if size > MAX_SETTINGS:
+            raise ValueError(
+                f'the grid has {size} settings, and at most {MAX_SETTINGS} are possible: '
+                'take latin_hypercube or sobol'
+            )
+        return self
+
+
+class Study(SceneModel):
+    """A study file."""
+
+    bags: list[str] = Field(
+        min_length=1,
+        description='bags, folders with bags anywhere below, or globs, relative to the study file',
+    )
+    settings: Designs = Field(description='designs: grid, cases, latin_hypercube, sobol')
+    outputs: list[OutputName] = Field(
+        default=list(OUTPUTS), min_length=1, description='columns of the table'
+    )
+    confidence: float = Field(
+        default=0.95, ge=0.5, le=0.999, description='level of the intervals, 0.5 to 0.999'
+    )
+
+
+def read_study(path: Path) -> Study:
+    """Read and check a study file.
+
+    Raises:
+        SceneError: one sentence with file, line, key, value and remedy.
+    """
+    return read_document(path, Study, 'study')

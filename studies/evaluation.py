@@ -1,0 +1,198 @@
+"""One row of a study, computed by a worker: a bag under a setting."""
+
+import resource
+import tempfile
+import time
+import traceback
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import get_args
+
+from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.reader import Bag, open_bag
+from cutting_trainer.bags.recorded_frames import FrameRecord
+from cutting_trainer.bags.recorded_indexings import recorded_indexings
+from cutting_trainer.bags.resimulation_start import ComputationStart, find_beginning
+from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
+from cutting_trainer.haptic_bridge.indexing import Indexing
+from cutting_trainer.haptic_bridge.scene_schema import (
+    DeviceSettings,
+    HapticsSettings,
+    SettingsError,
+    ToolSettings,
+)
+from cutting_trainer.haptic_bridge.warm_up import warm_up as warm_up_force_path
+from cutting_trainer.node_common.cdr_codec import StampedMessage
+from cutting_trainer.node_common.errors import MeshError, SceneError
+from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate_command import recomputation
+from cutting_trainer.recordings.what_if import (
+    RecordedForce,
+    computable_poses,
+    move_hand,
+    recompute,
+    recorded_force,
+)
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.studies.bag_collection import hash_of_bag
+from cutting_trainer.studies.designs import Setting
+from cutting_trainer.studies.identity import Identity, identity_of_worker
+from cutting_trainer.studies.outputs import outputs_of
+from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
+
+_SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError)
+_MAX_REASON = 500
+"""Characters of a reason."""
+_KEPT_BAGS = 2
+"""Bags that a worker keeps in memory: all settings of one follow one another."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A row to be computed.
+
+    Attributes:
+        bag: folder of the bag.
+        bag_hash: hash of its content.
+        setting: changes of the scene.
+        identity: code of whoever asks; a worker with other code refuses.
+    """
+
+    bag: str
+    bag_hash: str
+    setting: Setting
+    identity: Identity
+
+
+@dataclass(frozen=True)
+class Result:
+    """A computed row.
+
+    Attributes:
+        outputs: by name; empty for a failure.
+        failure: reason why there are none; ''.
+        differs_from_frame: of the session as recorded, the first frame that was computed otherwise
+            than recorded; 0: none.
+        identity: code and machine that computed it.
+        cpu: processor time of the row [s], without the warm-up of a new worker.
+        warm_up: processor time of that [s]; 0 for all but its first row.
+        memory: largest resident memory of the worker so far [bytes].
+        lost: no worker has computed it, for a reason that is not that of bag or setting.
+    """
+
+    outputs: dict[str, float]
+    failure: str
+    differs_from_frame: int
+    identity: Identity
+    cpu: float
+    warm_up: float
+    memory: int
+    lost: bool = False
+
+
+class OtherCodeError(RuntimeError):
+    """A worker has another version of the trainer or its libraries."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A bag as read once for all of its settings.
+
+    Attributes:
+        beginning: start of its computation.
+        records: frames.
+        poses: of the device.
+        indexings: changes of how the hand moves the tool.
+        felt: recorded force.
+    """
+
+    bag: Bag
+    beginning: ComputationStart
+    records: list[FrameRecord]
+    poses: list[StampedMessage]
+    indexings: list[Indexing]
+    felt: RecordedForce
+
+
+def evaluate(job: Job) -> Result:
+    """Compute a row. An error about bag or setting is a result, too.
+
+    Raises:
+        OtherCodeError: this worker has other code than whoever asks.
+    """
+    here = identity_of_worker()
+    if differences := job.identity.differences(here):
+        raise OtherCodeError('; '.join(differences))
+    began = time.thread_time()
+    warm_up()
+    warm, differs, failure, outputs = time.thread_time(), 0, '', dict[str, float]()
+    with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
+        try:
+            outputs, differs = _compute(job, Path(temporary))
+        except Exception as error:  # a row with its reason: the study goes on
+            failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
+    return Result(
+        outputs=outputs,
+        failure=failure,
+        differs_from_frame=differs,
+        identity=here,
+        cpu=time.thread_time() - warm,
+        warm_up=warm - began,
+        memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    )
+
+
+@cache
+def warm_up() -> None:
+    """Load all kernels in one order, once for each process.
+
+    Of a kernel inlined in several others a process runs the copy loaded first, and copies may
+    differ in the last bit. So the order must not depend on the rows that a worker happens to get.
+    """
+    warm_up_tissue()
+    for method in get_args(CuttingSettings.model_fields['method'].annotation):
+        warm_up_cutting(CuttingSettings(method=method))
+    device = DeviceSettings()
+    warm_up_force_path(ToolSettings(), device, HapticsSettings(), device.load_profile())
+
+
+def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int]:
+    """Return the outputs of a row, and the first frame that differs from the recording."""
+    recording = read_recording(job.bag, job.bag_hash)
+    bag, beginning, felt = recording.bag, recording.beginning, recording.felt
+    scene = load_scene(str(restore_scene(bag, folder, job.setting.in_yaml)))
+    changed, differs = job.setting.number > 0, None
+    computed = recomputation(scene, beginning, changed=changed)
+    if changed:
+        run = move_hand(recording.records, recording.poses, recording.indexings, scene, computed)
+    else:
+        run, differs = recompute(recording.records, felt, computed)
+    return outputs_of(run, felt.forces, computed.simulation.mesh), differs or 0
+
+
+@lru_cache(maxsize=_KEPT_BAGS)
+def read_recording(folder: str, expected_hash: str) -> Recording:
+    """Read a bag.
+
+    Raises:
+        BagError: it is unreadable, or another one than that of the study.
+        SessionError: the bag has no poses, or no forces of the hand.
+    """
+    if hash_of_bag(Path(folder)) != expected_hash:
+        raise BagError(f'{folder} is not the bag that the study was started with: it has changed')
+    bag = open_bag(folder)
+    records, poses = computable_poses(bag)
+    felt = recorded_force(bag, poses)
+    return Recording(bag, find_beginning(bag), records, poses, recorded_indexings(bag), felt)
+
+
+def _reason(error: Exception) -> str:
+    """Return a sentence about a failure, with its place where the sentence is not ours."""
+    text = ' '.join(str(error).split())
+    if isinstance(error, _SENTENCES):
+        return text
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f'{type(error).__name__} in {Path(place.filename).name}:{place.lineno}: {text}'

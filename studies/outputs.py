@@ -1,0 +1,59 @@
+"""Outputs of a study: one number for each bag and setting."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cutting_trainer.recordings.incision_metrics import surface_length
+from cutting_trainer.recordings.what_if import Run
+from cutting_trainer.tissue_sim.mesh.pieces import free_parts
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+
+
+@dataclass(frozen=True)
+class Output:
+    """One column of results.
+
+    Attributes:
+        unit: of the number; '' for counts.
+        meaning: in a few words.
+    """
+
+    unit: str
+    meaning: str
+
+
+OUTPUTS = {
+    'largest_force': Output('N', 'largest force on the hand'),
+    'mean_force_in_contact': Output('N', 'mean force on the hand in contact'),
+    'force_rms_difference': Output('N', 'rms difference to the recorded force on the hand'),
+    'largest_force_difference': Output('N', 'largest difference to the recorded force'),
+    'contact': Output('s', 'time in contact'),
+    'incision_area': Output('m^2', 'area of the incision, one side, at rest'),
+    'incision_length': Output('m', 'length of the incision on the surface, at rest'),
+    'pieces': Output('', 'pieces that came off'),
+    'elements_cut': Output('', 'tetrahedra taken out by cuts'),
+    'tetrahedra': Output('', 'tetrahedra at the end'),
+    'substeps': Output('', 'substeps of all frames'),
+    'frames_taken_back': Output('', 'frames that diverged and were taken back'),
+}
+"""All outputs by column."""
+
+
+def outputs_of(run: Run, recorded: NDArray[np.float64], mesh: TetMesh) -> dict[str, float]:
+    """Compute all outputs of a session.
+
+    Args:
+        run: the session.
+        recorded: norm of the recorded force on the hand at each tick [N], shape (n,).
+        mesh: tissue at the end.
+    """
+    off = np.abs(run.forces - recorded)
+    values = run.figures() | {
+        'force_rms_difference': float(np.sqrt(np.mean(off**2))),
+        'largest_force_difference': float(off.max(initial=0.0)),
+        'incision_length': surface_length(mesh),
+        'pieces': float(free_parts(mesh).max(initial=0)),
+    }
+    return {name: float(values[name]) for name in OUTPUTS}

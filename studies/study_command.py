@@ -1,0 +1,256 @@
+"""`trainer study`: recorded hands on many changed tissues, on all processors."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.exit_status import Status
+from cutting_trainer.studies.bag_collection import StudyBag, find_bags
+from cutting_trainer.studies.description import Study, read_study
+from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
+from cutting_trainer.studies.evaluation import Job, Result
+from cutting_trainer.studies.identity import identity_of_worker
+from cutting_trainer.studies.journal import Journal, key_of, open_journal
+from cutting_trainer.studies.summary import PAGE_FILE, StudySummary, as_text, summarise, write_page
+from cutting_trainer.studies.table import COSTS_FILE, TABLE_FILE, Row, write_costs, write_table
+
+_TABLE_PERIOD_S = 5.0
+_MAX_TABLE_SHARE = 0.05
+"""Share of the time that may go into tables of partial results."""
+NO_DASK = (
+    'a study needs Dask, which is not installed: `./trainer setup` installs it, and elsewhere '
+    '`pip install "cutting_trainer[study]"`'
+)
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """Options of the command.
+
+    Attributes:
+        file: study file.
+        output: folder of the results; None: that of the file's name beside it.
+        workers: number of own workers; 0: one for each processor.
+        scheduler: address of a scheduler with workers; '': own workers.
+        as_json: print the outcome as JSON.
+    """
+
+    file: Path
+    output: Path | None = None
+    workers: int = 0
+    scheduler: str = ''
+    as_json: bool = False
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the results."""
+        return self.output or self.file.with_suffix('')
+
+
+@dataclass
+class Plan:
+    """Rows of a study, done or not.
+
+    Attributes:
+        lost: results that no worker could compute this time, by key.
+    """
+
+    study: Study
+    bags: list[StudyBag]
+    settings: list[Setting]
+    journal: Journal
+    lost: dict[tuple[str, str], Result]
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self.bags) * len(self.settings)
+
+    def jobs(self) -> list[Job]:
+        """Return the rows to be computed, bag by bag, the session as recorded first."""
+        here = identity_of_worker()
+        return [
+            Job(str(bag.path), bag.hash, setting, here)
+            for bag in self.bags
+            for setting in self.settings
+            if key_of(bag.hash, setting) not in self.journal.rows
+        ]
+
+    def rows(self) -> list[Row]:
+        """Return the rows that are done, in the order of bags and settings."""
+        results = self.lost | self.journal.rows
+        return [
+            Row(bag, setting, results[key])
+            for bag in self.bags
+            for setting in self.settings
+            if (key := key_of(bag.hash, setting)) in results
+        ]
+
+    def take(self, job: Job, result: Result) -> None:
+        """Keep a result."""
+        key = key_of(job.bag_hash, job.setting)
+        if result.lost:
+            self.lost[key] = result
+        else:
+            self.journal.append(key, result)
+
+
+def run_study(options: StudyOptions) -> Status:
+    """Compute a study, or go on with it, and print its summary.
+
+    Raises:
+        SceneError: the study file is not valid.
+        SessionError: there are no bags, no scheduler, or no Dask.
+    """
+    if find_spec('distributed') is None:
+        raise SessionError(NO_DASK)
+    study = read_study(options.file)
+    bags = find_bags(study.bags, options.file.resolve().parent)
+    settings = [RECORDED, *settings_of(study.settings)]
+    if not options.folder.parent.is_dir() or options.folder.is_file():
+        raise SessionError(
+            f'{options.folder} cannot be made: name a folder with --output in one that exists'
+        )
+    options.folder.mkdir(exist_ok=True)
+    with open_journal(options.folder, identity_of_worker()) as journal:
+        plan = Plan(study, bags, settings, journal, {})
+        notes = Console(stderr=True, soft_wrap=True)
+        interrupted = not _compute(plan, options, notes)
+        _write_tables(options.folder, plan)
+        rows = plan.rows()
+        summary = summarise(rows, study, plan.size)
+        write_page(options.folder / PAGE_FILE, options.file.stem, summary)
+    _tell(options, plan, rows, summary)
+    if interrupted:
+        notes.print('interrupted: the same command goes on with what is left', highlight=False)
+        return Status.INTERRUPTED
+    return Status.FAILED if summary.failures else Status.OK
+
+
+def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
+    """Compute what is left of a study; return False where it was interrupted."""
+    jobs = plan.jobs()
+    done = plan.size - len(jobs)
+    if plan.journal.outdated:
+        notes.print(
+            f'{plan.journal.outdated} rows of {options.folder} are of other code or libraries, and '
+            'are computed again',
+            highlight=False,
+        )
+    if not jobs:
+        return True
+    if done:
+        notes.print(f'{done} of {plan.size} rows are done already', highlight=False)
+    try:
+        with _workers(options, len(jobs)) as client, _progress(notes) as bar:
+            threads = sum(client.nthreads().values())
+            notes.print(
+                f'{len(plan.bags)} bags, {len(plan.settings) - 1} settings, {threads} workers; '
+                f'dashboard: {escape(client.dashboard_link)}',
+                highlight=False,
+            )
+            task = bar.add_task('rows', total=plan.size, completed=done, failed='')
+            save = _saving(lambda: _write_tables(options.folder, plan))
+            failed = 0
+            for job, result in _computed(client, jobs):
+                plan.take(job, result)
+                failed += bool(result.failure)
+                bar.update(task, advance=1, failed=f'{failed} failed' if failed else '')
+                save()
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def _workers(options: StudyOptions, most: int) -> AbstractContextManager[Any]:
+    from cutting_trainer.studies.cluster import others_cluster, own_cluster
+
+    if options.scheduler:
+        return others_cluster(options.scheduler)
+    return own_cluster(min(options.workers or len(os.sched_getaffinity(0)), most))
+
+
+def _computed(client: Any, jobs: list[Job]) -> Iterator[tuple[Job, Result]]:
+    from cutting_trainer.studies.cluster import compute
+
+    return compute(client, jobs)
+
+
+def _progress(notes: Console) -> Progress:
+    columns = (
+        TextColumn('{task.description}'),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn('{task.fields[failed]}'),
+    )
+    return Progress(*columns, console=notes, transient=True)
+
+
+def _saving(write: Callable[[], None]) -> Callable[[], None]:
+    """Return a function that writes if the last time was long enough ago."""
+    period, last = _TABLE_PERIOD_S, time.monotonic()
+
+    def save() -> None:
+        nonlocal period, last
+        began = time.monotonic()
+        if began - last >= period:
+            write()
+            last = time.monotonic()
+            period = max(_TABLE_PERIOD_S, (last - began) / _MAX_TABLE_SHARE)
+
+    return save
+
+
+def _write_tables(folder: Path, plan: Plan) -> None:
+    rows = plan.rows()
+    write_table(folder / TABLE_FILE, rows, plan.study.outputs)
+    write_costs(folder / COSTS_FILE, rows)
+
+
+def _tell(options: StudyOptions, plan: Plan, rows: list[Row], summary: StudySummary) -> None:
+    files = [str(options.folder / name) for name in (TABLE_FILE, COSTS_FILE, PAGE_FILE)]
+    if options.as_json:
+        report = {
+            'written': files,
+            'bags': len(plan.bags),
+            'settings': len(plan.settings) - 1,
+            'rows': len(rows),
+            'planned': plan.size,
+            'failures': summary.failures,
+            'effects': [_plain(effect) for effect in summary.settings],
+            'effects_of_keys': [_plain(effect) for effect in summary.keys],
+            'notes': summary.notes,
+        }
+        json.dump(report, sys.stdout, indent=2)
+        print()
+        return
+    console = Console(soft_wrap=True)
+    console.print(as_text(summary), highlight=False)
+    for file in files:
+        console.print(f'wrote {escape(file)}', highlight=False)
+
+
+def _plain(effect: Any) -> dict[str, object]:
+    """Return an effect for JSON, which has no NaN."""
+    return {k: None if v != v else v for k, v in asdict(effect).items()}

@@ -1,0 +1,274 @@
+"""Studies without their workers: files, settings, bags, journal, effects."""
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.session.errors import SessionError
+from cutting_trainer.studies.bag_collection import StudyBag, find_bags, hash_of_bag
+from cutting_trainer.studies.description import Study, read_study
+from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
+from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings, interval
+from cutting_trainer.studies.evaluation import Result
+from cutting_trainer.studies.identity import identity_of_worker
+from cutting_trainer.studies.journal import JOURNAL_FILE, Journal, key_of, open_journal
+from cutting_trainer.studies.outputs import OUTPUTS
+from cutting_trainer.studies.summary import as_text, summarise, write_page
+from cutting_trainer.studies.table import Row, write_table
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLES = ROOT / 'bags' / 'samples' / 'format_6'
+GOOD = """\
+bags: [bags]
+settings:
+  grid:
+    tissue.material.toughness: [100, 200]
+    cutting.method: [combined, delete]
+  latin_hypercube:
+    samples: 5
+    ranges:
+      tissue.material.toughness: {low: 50, high: 400, scale: log}
+outputs: [largest_force]
+"""
+BAD_EDITS = [
+    # what is wrong, text, its replacement, line, and what the sentence must say
+    ('unknown section', 'outputs', 'output', 10, ['output', 'did you mean outputs?']),
+    ('no bags', 'bags: [bags]\n', '', 1, ['the file', 'bags is missing']),
+    ('empty bags', '[bags]', '[]', 1, ['bags', 'at least 1 item']),
+    ('unknown design', 'latin_hypercube', 'latin_cube', 6, ['did you mean latin_hypercube?']),
+    ('unknown output', 'largest_force', 'largest_forces', 10, ['did you mean largest_force?']),
+    ('unknown scene section', 'cutting.method', 'cuting.method', 5, ['did you mean cutting?']),
+    ('unknown scene key', 'cutting.method', 'cutting.metod', 5, ['did you mean method?']),
+    ('no scene key', 'cutting.method', 'cutting', 5, ['give section and key']),
+    ('key of a value', 'cutting.method', 'cutting.method.x', 5, ['x is not a key of a scene']),
+    ('the hand', 'cutting.method', 'arm.script', 5, ['arm', 'recorded hands']),
+    ('no values', '[100, 200]', '[]', 4, ['toughness', 'at least 1 item']),
+    ('a value, not a list', '[100, 200]', '100', 4, ['toughness is 100', 'valid array']),
+    ('range the wrong way', 'low: 50', 'low: 500', 9, ['high is 400', 'above low, 500']),
+    ('logarithm of nothing', 'low: 50', 'low: 0', 9, ['scale log', 'above 0']),
+    ('one sample', 'samples: 5', 'samples: 1', 7, ['samples', '1', 'number of settings']),
+    ('samples of Sobol', 'latin_hypercube', 'sobol', 6, ['samples is 5', 'as 4 or 8']),
+    ('no YAML', 'bags: [bags]', 'bags: [bags', 2, ['not valid YAML']),
+]
+
+
+def study(tmp_path: Path, text: str) -> Study:
+    file = tmp_path / 'study.yaml'
+    file.write_text(text)
+    return read_study(file)
+
+
+@pytest.mark.parametrize(('text', 'instead', 'line', 'said'), [e[1:] for e in BAD_EDITS],
+                         ids=[e[0] for e in BAD_EDITS])  # fmt: skip
+def test_bad_study_file_gives_one_sentence_with_its_place(
+    text: str, instead: str, line: int, said: list[str], tmp_path: Path
+) -> None:
+    assert text in GOOD
+    with pytest.raises(SceneError) as caught:
+        study(tmp_path, GOOD.replace(text, instead, 1))
+    sentence = str(caught.value)
+    assert '\n' not in sentence
+    found = int(sentence.partition('study.yaml:')[2].partition(':')[0])
+    assert found == line, sentence
+    assert all(words in sentence for words in said), sentence
+
+
+def test_study_file_without_a_design_names_the_designs(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match='there is no design: give grid, cases'):
+        study(tmp_path, 'bags: [bags]\nsettings: {}\n')
+
+
+def test_settings_are_those_of_all_designs_each_once(tmp_path: Path) -> None:
+    text = GOOD.replace('  latin', '  cases: [{tissue.model: linear}, {}, {}]\n  latin')
+    settings = settings_of(study(tmp_path, text).settings)
+    assert [s.number for s in settings] == list(range(1, 12))
+    first = {'tissue.material.toughness': 100, 'cutting.method': 'combined'}
+    assert settings[0].changes == first
+    assert settings[4].changes == {'tissue.model': 'linear'} and settings[5].changes == {}
+    turned = dict(reversed(first.items()))
+    assert Setting(7, turned).identity == settings[0].identity  # the order of keys is none
+
+
+def test_hypercube_has_one_sample_in_each_part_of_a_range_and_sobol_too(tmp_path: Path) -> None:
+    text = GOOD.replace('samples: 5', 'samples: 16\n    seed: 3')
+    for design in ('latin_hypercube', 'sobol'):
+        made = study(tmp_path, text.replace('latin_hypercube', design))
+        values = [s.changes['tissue.material.toughness'] for s in settings_of(made.settings)[4:]]
+        shares = np.log(np.array(values, float) / 50) / np.log(400 / 50)
+        assert sorted(np.floor(16 * shares)) == list(range(16))
+        assert settings_of(made.settings) == settings_of(made.settings)
+
+
+def test_bags_are_found_below_folders_and_by_globs_each_content_once(tmp_path: Path) -> None:
+    shutil.copytree(SAMPLES / 'palpation', tmp_path / 'a' / 'b' / 'first')
+    shutil.copytree(SAMPLES / 'palpation', tmp_path / 'a' / 'copy')
+    shutil.copytree(SAMPLES / 'straight_cut', tmp_path / 'a' / 'c')
+    (tmp_path / 'a' / 'c' / 'report.html').write_text('what is beside a bag is not of it')
+    found = find_bags(['a', 'a/*'], tmp_path)
+    assert [bag.name for bag in found] == ['a/b/first', 'a/c']
+    assert found[1].hash == hash_of_bag(SAMPLES / 'straight_cut')
+    for pattern, said in (('x*', 'no file matches'), ('aa', 'does not exist'), ('.git', 'exist')):
+        with pytest.raises(SessionError, match=said):
+            find_bags([pattern], tmp_path)
+    (tmp_path / 'empty').mkdir()
+    with pytest.raises(SessionError, match='there is no bag in it'):
+        find_bags(['empty'], tmp_path)
+
+
+def result(force: float, failure: str = '') -> Result:
+    values = dict.fromkeys(OUTPUTS, 0.0) | {'largest_force': force}
+    return Result({} if failure else values, failure, 0, identity_of_worker(), 1.0, 0.0, 1)
+
+
+def test_rows_are_read_back_and_those_of_other_code_or_cut_off_are_not(tmp_path: Path) -> None:
+    here, setting = identity_of_worker(), Setting(1, {'tissue.model': 'linear'})
+    old = replace(result(1.0), identity=replace(here, kernels='other'))
+    elsewhere = replace(result(2.0), identity=replace(here, cpu='another processor'))
+    kept = result(0.1 + 0.2)
+    with open_journal(tmp_path, here) as journal:
+        journal.append(key_of('a', RECORDED), old)
+        journal.append(key_of('b', RECORDED), elsewhere)
+        journal.append(key_of('b', setting), kept)
+        with (
+            pytest.raises(SessionError, match='another study'),
+            open_journal(tmp_path, here) as _,
+        ):
+            pass
+    file = tmp_path / JOURNAL_FILE
+    whole = file.read_bytes()
+    file.write_bytes(whole + whole.splitlines()[0][:-9])
+    with open_journal(tmp_path, here) as journal:
+        assert journal.rows == {('b', ''): elsewhere, ('b', setting.identity): kept}
+        assert journal.outdated == 1
+    assert file.read_bytes() == whole
+    file.write_text('{"key": 3}\n')
+    with (
+        pytest.raises(SessionError, match=r'rows\.jsonl:1 is not a row'),
+        open_journal(tmp_path, here) as _,
+    ):
+        pass
+
+
+def test_full_disk_gives_one_sentence() -> None:
+    full = os.open('/dev/full', os.O_WRONLY)
+    journal = Journal(Path('rows.jsonl'), {}, 0, full)
+    with pytest.raises(SessionError, match=r'No space left on device\): make room'):
+        journal.append(('a', ''), result(1.0))
+    os.close(full)
+    assert not journal.rows
+
+
+def bags(count: int) -> list[StudyBag]:
+    return [StudyBag(f'bag{i}', Path(f'bag{i}'), f'{i:016x}') for i in range(count)]
+
+
+def test_table_has_a_type_for_each_key_and_the_same_bytes_each_time(tmp_path: Path) -> None:
+    settings = [
+        RECORDED,
+        Setting(1, {'a.number': 1, 'a.word': 'x', 'a.list': [1]}),
+        Setting(2, {'a.number': 0.5, 'a.word': True}),
+    ]
+    rows = [Row(bags(1)[0], s, result(float(s.number))) for s in settings]
+    rows[2] = replace(rows[2], result=result(0.0, 'it diverged'))
+    write_table(tmp_path / 'a.parquet', rows, ['largest_force'])
+    write_table(tmp_path / 'b.parquet', rows, ['largest_force'])
+    assert (tmp_path / 'a.parquet').read_bytes() == (tmp_path / 'b.parquet').read_bytes()
+    read = pq.read_table(tmp_path / 'a.parquet').to_pydict()
+    assert read['a.number'] == [None, 1.0, 0.5]
+    assert read['a.word'] == [None, 'x', 'true'] and read['a.list'] == [None, '[1]', None]
+    assert read['largest_force'] == [0.0, 1.0, None]
+    assert read['failure'] == ['', '', 'it diverged']
+    assert {'cpu', 'kernels', 'code', 'numpy'} <= read.keys()
+    write_table(tmp_path / 'none.parquet', [], ['largest_force'])  # before the first row
+
+
+# Effects, beside exact ones.
+
+
+def made_rows(count: int, settings: list[Setting], forces: np.ndarray) -> list[Row]:
+    """Rows of bags and settings, the recorded one first, with forces [N], shape (bags, n)."""
+    return [
+        Row(bag, setting, result(float(forces[i, k])))
+        for i, bag in enumerate(bags(count))
+        for k, setting in enumerate([RECORDED, *settings])
+    ]
+
+
+def test_effects_of_a_linear_output_are_its_coefficients_in_each_bag(tmp_path: Path) -> None:
+    settings = [
+        Setting(1 + 3 * i + k, {'s.x': x, 's.word': word})
+        for i, x in enumerate((1.0, 2.0, 5.0))
+        for k, word in enumerate(('a', 'b', 'c'))
+    ]
+    random = np.random.default_rng(5)
+    level = random.normal(size=12)
+    per_x, of_b, of_c = 0.3 + 0.1 * random.normal(size=(3, 12)) * [[1], [2], [0]]
+    change = np.array([[per_x * s.changes['s.x'], of_b, of_c] for s in settings], dtype=object)
+    columns = [level] + [
+        level + c[0] + {'a': 0.0, 'b': c[1], 'c': c[2]}[s.changes['s.word']]
+        for s, c in zip(settings, change, strict=True)
+    ]
+    rows = made_rows(12, settings, np.array(columns).T)
+    found, why_not = effects_of_keys(rows, ['largest_force'], 0.95)
+    by_cause = {effect.cause: effect for effect in found}
+    assert not why_not and by_cause.keys() == {'x 1 -> 5', 'word a -> b', 'word a -> c'}
+    assert by_cause['x 1 -> 5'].mean == pytest.approx(4 * per_x.mean())
+    assert by_cause['word a -> b'].mean == pytest.approx(of_b.mean())
+    steady = by_cause['word a -> c']
+    assert (steady.mean, steady.low, steady.high) == pytest.approx((0.3, 0.3, 0.3))
+    of_settings = effects_of_settings(rows, ['largest_force'], 0.95)
+    assert of_settings[4].mean == pytest.approx((2 * per_x + of_b).mean())
+    assert of_settings[4].low < of_settings[4].mean < of_settings[4].high
+    assert of_settings[4].reference == pytest.approx(level.mean())
+
+    summary = summarise(rows, study(tmp_path, GOOD), len(rows) + 1)
+    assert f'{len(rows)} of {len(rows) + 1} rows' in summary.notes[0]
+    assert as_text(summary).renderables
+    write_page(tmp_path / 'page.html', '<study>', summary)
+    text = (tmp_path / 'page.html').read_text()
+    assert 'x=5, word=c' in text and '&lt;study&gt;' in text and text.count('<img') == 1
+
+
+def test_failed_row_takes_its_bag_out_of_the_effect_of_its_setting_alone() -> None:
+    settings = [Setting(1, {'s.x': 1}), Setting(2, {'s.x': 2})]
+    forces = np.array([[0.0, 1.0, 2.0], [0.0, 3.0, 4.0], [0.0, 5.0, 6.0]])
+    rows = made_rows(3, settings, forces)
+    rows[4] = replace(rows[4], result=result(0.0, 'the haptic bridge comes to a FAULT'))
+    first, second = effects_of_settings(rows, ['largest_force'], 0.9)
+    assert (first.mean, first.bags) == (3.0, 2) and (second.mean, second.bags) == (4.0, 3)
+
+
+def test_keys_that_change_together_have_no_effects_of_their_own() -> None:
+    together = [Setting(1, {'s.x': 1, 's.y': 1}), Setting(2, {'s.x': 2, 's.y': 2})]
+    forces = np.zeros((4, 3))
+    assert effects_of_keys(made_rows(4, together, forces), ['largest_force'], 0.9) == (
+        [],
+        'the settings cannot tell the effects of their keys apart: add settings',
+    )
+
+
+def test_intervals_of_a_mean_cover_it_about_as_often_as_they_say() -> None:
+    random = np.random.default_rng(1)
+    covered = 0
+    for _ in range(100):
+        _, low, high = interval(random.exponential(size=30), 0.9)
+        covered += low <= 1.0 <= high
+    assert 78 <= covered <= 97  # 0.9 +- 3.5 standard deviations, less what skewness takes
+    assert interval(np.array([2.0, 2.0]), 0.9) == (2.0, 2.0, 2.0)
+    mean, low, high = interval(np.array([2.0]), 0.9)
+    assert mean == 2.0 and np.isnan([low, high]).all()
+
+
+def test_reading_rows_needs_no_library_of_ours(tmp_path: Path) -> None:
+    with open_journal(tmp_path, identity_of_worker()) as journal:
+        journal.append(('a', ''), result(1.5))
+    (line,) = (tmp_path / JOURNAL_FILE).read_text().splitlines()
+    read = json.loads(line)
+    assert read['key'] == ['a', ''] and read['outputs']['largest_force'] == 1.5
