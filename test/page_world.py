@@ -22,6 +22,7 @@ from cutting_trainer.viewer.appearance import (
     FLOOR,
     camera,
     reach,
+    shown_exercise,
     shown_tissue,
     tool_shape,
 )
@@ -140,6 +141,7 @@ class StandIn:
             'metres_per_newton': 0.02,
             'tissues': tissues,
             'plots_span': 15.0 if live else 20.0,
+            'exercise': shown_exercise(self._scene.exercise),
         }
         self.server.put('hello', **(content | self._says.get('hello', {})))
 

@@ -8,6 +8,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
@@ -19,6 +20,7 @@ from cutting_trainer.viewer.appearance import (
     METRES_PER_NEWTON,
     camera,
     reach,
+    shown_exercise,
     shown_tissue,
     tool_shape,
 )
@@ -90,11 +92,19 @@ class LivePage:
     Args:
         server: of the pages.
         tool: to draw.
+        exercise: to show.
         controls: allowed requests at the beginning.
     """
 
-    def __init__(self, server: PageServer, tool: ToolSettings, controls: LiveControls) -> None:
+    def __init__(
+        self,
+        server: PageServer,
+        tool: ToolSettings,
+        exercise: ExerciseSettings,
+        controls: LiveControls,
+    ) -> None:
         self._server, self._tool, self._controls = server, tool, controls
+        self._exercise = exercise
         self._source = TissueSource(TISSUE)
         self._history = History(4, _SAMPLES)
         self._gauge: SurfaceDepth | None = None
@@ -125,6 +135,7 @@ class LivePage:
             metres_per_newton=METRES_PER_NEWTON,
             tissues=[shown_tissue(TISSUE, '')],
             plots_span=PLOT_SPAN_S,
+            exercise=shown_exercise(self._exercise),
         )
 
     def _allow(self, **changes: object) -> None:
@@ -133,9 +144,9 @@ class LivePage:
             self._controls = changed
             self._server.allow(changed)
 
-    def equip(self, tool: ToolSettings) -> None:
-        """Replace the drawn tool, for another tissue."""
-        self._tool, self._gauge = tool, None
+    def equip(self, tool: ToolSettings, exercise: ExerciseSettings) -> None:
+        """Replace the drawn tool and the exercise, for another tissue."""
+        self._tool, self._exercise, self._gauge = tool, exercise, None
 
     def show(
         self,
