@@ -96,6 +96,11 @@ class StandIn:
 
     close = stop
 
+    def move(self, along: float) -> None:
+        """Moves the whole tissue along y [m]."""
+        self._tissue.displacement[:, 1] = along
+        self._tissue.revision += 1
+
     def of(self, kind: type) -> list[Any]:
         """What was asked for, of one kind."""
         return [message for message in self.asked if isinstance(message, kind)]
