@@ -2,14 +2,18 @@
 
 import json
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bench.page.open_page import read_tissue
 from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.viewer.appearance import shown_exercise
+from cutting_trainer.viewer.attempt_progress import AttemptProgress
 from cutting_trainer.viewer.drawn_surface import CUT, OUTER, TissueSource
+from cutting_trainer.viewer.tool_state import Moment
 
 
 def test_page_has_the_curves_zones_lesion_and_limits_of_the_scene() -> None:
@@ -52,3 +56,60 @@ def test_places_at_rest_belong_to_the_vertices_of_the_outside_and_come_with_face
     outer = parts[0][0]
     assert np.array_equal(places + 0.25, outer[:, :2]) and len(places) == 3
     assert not len(read_tissue(frame.moved)[3])
+
+
+def moment(tip: list[float], contact: int, force: float) -> Moment:
+    place = np.array(tip)
+    blade = place + np.array([[0, 0, 0.02], [0, 0, -0.004]])
+    return Moment(place, np.array([1.0, 0, 0, 0]), blade, place, contact, np.array([0, 0, force]))
+
+
+def attempt_of(scene: str, way: list[tuple[list[float], int, float]]) -> Any:
+    """Newest report on an attempt whose tip goes through places, half a second at each."""
+    simulation = make_simulation(load_scene(scene).tissue)[0]
+    replica = SimpleNamespace(**replica_fields(simulation.mesh), revision=7, topology=0)
+    progress = AttemptProgress(load_scene(scene).exercise)
+    content, now = None, 100.0
+    for tip, contact, force in way:
+        for _ in range(16):
+            content = progress.see(now, replica, moment(tip, contact, force)) or content
+            now += 1 / 30
+    return content, progress, replica, now
+
+
+def replica_fields(mesh: Any) -> dict[str, Any]:
+    return {
+        name: np.asarray(getattr(mesh, name))
+        for name in ('rest', 'tetrahedra', 'triangles', 'triangle_kind', 'fixed')
+    }
+
+
+def rows(content: Any) -> dict[str, tuple[str, bool]]:
+    return {row['name']: (row['value'], row['over']) for row in content['rows']}
+
+
+def test_progress_of_an_attempt_is_shown_and_the_score_once_the_tip_is_back() -> None:
+    start, above, inside = [-0.018, 0.0, 0.040], [-0.018, 0.0, 0.030], [0.0, 0.0, 0.012]
+    way = [(start, 0, 0.0), (above, 0, 0.0), (inside, 2, 3.5), (above, 0, 0.0)]
+    content, progress, replica, now = attempt_of('vessel', way)
+    shown = rows(content)
+    assert content['score'] is None
+    assert shown['peak force'] == ('3.5 N', True)
+    assert shown['target that is opened'] == ('0 %', False)
+    assert shown['forbidden zones cut'] == ('0', False)
+    assert float(shown['time'][0].split()[0]) == pytest.approx(1.5, abs=0.6)
+    content = progress.see(now + 1, replica, moment([0.018, 0, 0.040], 0, 0.0))
+    assert content is not None and content['score']['passed'] is False
+    assert any('target that is opened' in reason for reason in content['score']['reasons'])
+    replica.revision = 0  # a new tissue
+    content = progress.see(now + 2, replica, moment([-0.018, 0, 0.040], 0, 0.0))
+    assert content is not None and content['score'] is None
+    assert rows(content)['time'] == ('0 s', False)
+
+
+def test_marks_are_counted_and_not_judged_before_the_end() -> None:
+    up, down = [0.02, 0.02, 0.030], [0.02, 0.02, 0.022]  # no lump is below
+    way = [([0.0, 0.0, 0.045], 0, 0.0), (up, 0, 0.0), *[(down, 1, 0.4)] * 3, (up, 0, 0.0)]
+    content, *_ = attempt_of('lumps', way)
+    assert rows(content)['marks'] == ('1', False)
+    assert 'lump' not in json.dumps(content['rows'])

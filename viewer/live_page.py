@@ -24,6 +24,7 @@ from cutting_trainer.viewer.appearance import (
     shown_tissue,
     tool_shape,
 )
+from cutting_trainer.viewer.attempt_progress import AttemptProgress
 from cutting_trainer.viewer.drawn_surface import TissueSource
 from cutting_trainer.viewer.page_protocol import MAX_NAME, VERSION
 from cutting_trainer.viewer.page_server import PageServer
@@ -104,7 +105,7 @@ class LivePage:
         controls: LiveControls,
     ) -> None:
         self._server, self._tool, self._controls = server, tool, controls
-        self._exercise = exercise
+        self._begin_exercise(exercise)
         self._source = TissueSource(TISSUE)
         self._history = History(4, _SAMPLES)
         self._gauge: SurfaceDepth | None = None
@@ -146,7 +147,13 @@ class LivePage:
 
     def equip(self, tool: ToolSettings, exercise: ExerciseSettings) -> None:
         """Replace the drawn tool and the exercise, for another tissue."""
-        self._tool, self._exercise, self._gauge = tool, exercise, None
+        self._tool, self._gauge = tool, None
+        self._begin_exercise(exercise)
+        self._server.put('attempt', rows=[], score=None)
+
+    def _begin_exercise(self, exercise: ExerciseSettings) -> None:
+        self._exercise = exercise
+        self._progress = AttemptProgress(exercise) if exercise.title else None
 
     def show(
         self,
@@ -178,10 +185,17 @@ class LivePage:
         if moment is not None and moment.is_finite:
             force, depth = float(np.linalg.norm(moment.force)), self._depth(moment)
             put_moment(self._server, moment, depth, can_guide=can_guide)
+            self._show_progress(now, replica, moment)
         self._history.add(now, force, depth, *rates)
         if now >= self._next_plot:
             self._next_plot = now + _PLOT_PERIOD_S
             self._plot()
+
+    def _show_progress(self, now: float, replica: MeshReplica, moment: Moment) -> None:
+        if self._progress is None or replica.revision < 0:
+            return
+        if (content := self._progress.see(now, replica, moment)) is not None:
+            self._server.put('attempt', **content)
 
     def _depth(self, moment: Moment) -> float:
         if self._gauge is None:

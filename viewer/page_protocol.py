@@ -19,6 +19,7 @@ the one before:
 | moment | tip, wxyz, proxy, force, depth, can_guide, contact |
 | plots | span, lines of title, unit, times, values and colours by name, least |
 | playhead | time, playing, speed |
+| attempt | rows of name, value, over; score: null, or points, passed, reasons once the tip is back at the end |
 | notice | id, text |
 | refused | op, why: only to the page that asked |
 | pong | id: the same, age: of the newest session update [s] |

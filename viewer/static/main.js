@@ -60,6 +60,7 @@ const takers = {
     allowGuide();
     guide?.show();
   },
+  attempt: (message) => task.show(message),
   plots: (message) => {
     seen.plots += 1;
     plots.show(message);
