@@ -109,11 +109,22 @@ class Attempt:
         return values
 
     @property
+    def over(self) -> bool:
+        """Whether the tip touched tissue and is back at the end."""
+        return self._is_back() is True
+
+    @property
     def broken_off(self) -> bool:
         """Whether the tip touched tissue and was not back at the end when the samples ended."""
+        return self._is_back() is False
+
+    def _is_back(self) -> bool | None:
+        """Return whether the tip is back at the end; None: no end, or nothing was touched."""
         motion = np.concatenate([np.zeros((0, 11)), *self._motion])
         touched = np.flatnonzero(motion[:, 10] > 0)
-        return bool(self.exercise.end and len(touched) and self._back(motion, touched[-1]) is None)
+        if self.exercise.end is None or not len(touched):
+            return None
+        return self._back(motion, touched[-1]) is not None
 
     def marks(self) -> Floats:
         """Return the places that were marked [m], shape (h, 3)."""

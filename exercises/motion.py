@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+from scipy import ndimage, signal
 
 Floats = NDArray[np.float64]
 
@@ -108,8 +108,15 @@ def holds(
     if len(times) < count:
         return np.zeros((0, 3))
     windows = np.lib.stride_tricks.sliding_window_view(positions, count, axis=0)
-    still = (np.ptp(windows, axis=2) <= 2 * radius).all(axis=1)
-    firm = np.lib.stride_tricks.sliding_window_view(pressed, count).all(axis=1)
+    high, low, least = (
+        of(values, count, axis=0, origin=-(count // 2))[: len(windows)]
+        for of, values in (
+            (ndimage.maximum_filter1d, positions),
+            (ndimage.minimum_filter1d, positions),
+            (ndimage.minimum_filter1d, pressed.astype(np.uint8)),
+        )
+    )
+    still, firm = (high - low <= 2 * radius).all(axis=1), least > 0
     # A hold goes on until the tip is released: it is one mark, at its first place.
     found = np.flatnonzero(still & firm)
     if not len(found):

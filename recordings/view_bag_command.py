@@ -69,7 +69,9 @@ def view_bag(options: ReplayOptions) -> Status:
         if options.resimulate or options.changes:
             name = ', '.join(f'{k}={v}' for k, v in options.changes.items()) or 'computed again'
             computed = resimulated(bag, scene, notes, changed=bool(options.changes))
-        page = ReplayPage(bag, scene.tool, scene.device, computed, name, host, port, gate)
+        page = ReplayPage(
+            bag, scene.tool, scene.device, scene.exercise, computed, name, host, port, gate
+        )
     with _interrupts() as seen:
         shown = link(host, page.server.port, names, gate.token)
         notes.print(f'page: {shown} (Ctrl-C ends it)', highlight=False, soft_wrap=True)

@@ -22,6 +22,7 @@ from cutting_trainer.viewer.appearance import (
     FLOOR,
     camera,
     reach,
+    shown_exercise,
     shown_tissue,
     tool_shape,
 )
@@ -95,6 +96,11 @@ class StandIn:
 
     close = stop
 
+    def move(self, along: float) -> None:
+        """Moves the whole tissue along y [m]."""
+        self._tissue.displacement[:, 1] = along
+        self._tissue.revision += 1
+
     def of(self, kind: type) -> list[Any]:
         """What was asked for, of one kind."""
         return [message for message in self.asked if isinstance(message, kind)]
@@ -140,6 +146,7 @@ class StandIn:
             'metres_per_newton': 0.02,
             'tissues': tissues,
             'plots_span': 15.0 if live else 20.0,
+            'exercise': shown_exercise(self._scene.exercise),
         }
         self.server.put('hello', **(content | self._says.get('hello', {})))
 

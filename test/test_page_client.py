@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -398,3 +399,90 @@ def test_page_asks_only_this_server_for_what_it_shows(browser: Browser) -> None:
         assert page.requests
         for url in page.requests:
             assert url.startswith((site, site.replace('http', 'ws'), 'about:')), url
+
+
+TASK = """(() => {
+    const box = e => e.getBoundingClientRect();
+    const task = document.querySelector('#task'), one = box(task);
+    const view = box(document.querySelector('#view'));
+    const apart = one.bottom <= view.top + 1 || one.top >= view.bottom - 1
+        || one.right <= view.left + 1 || one.left >= view.right - 1;
+    const seen = [...task.children].filter(e => e.offsetHeight).map(e => {
+        e.scrollIntoView({block: 'center'});
+        const {x, y, width, height} = box(e);
+        return task.contains(document.elementFromPoint(x + width / 2, y + height / 2));
+    });
+    return {apart, seen, wide: task.scrollWidth > task.clientWidth, text: task.innerText};
+})()"""
+
+
+@pytest.mark.parametrize('mode', ['live', 'replay'])
+def test_exercise_is_read_at_every_size_and_stands_beside_the_picture(
+    browser: Browser, mode: str
+) -> None:
+    stand_in = StandIn('vessel', mode)
+    if mode == 'live':
+        reason = 'peak force: 5.2 N; full marks at 2.5 N, none at 5 N: -7.1 points, and more words'
+        stand_in.server.put(
+            'attempt',
+            rows=[{'name': 'peak force', 'value': '5.2 N', 'over': True}] * 5,
+            score={'points': 61, 'passed': False, 'reasons': [reason] * 6},
+        )
+    with opened(browser, stand_in) as page:
+        for width, height in SIZES:
+            page.resize(width, height)
+            there = page.evaluate(TASK)
+            assert there['apart'] and not there['wide'], (width, height, there)
+            assert there['seen'] and all(there['seen']), (width, height, there)
+            assert 'Beside a vessel' in there['text'] and '120 s' in there['text']
+            assert ('▲ 5.2 N' in there['text']) == (mode == 'live')
+            assert ('✕ not passed: 61 of 100 points' in there['text']) == (mode == 'live')
+            assert 'do not cut' in there['text'] and 'lesion' not in there['text']
+        page.resize(1000, 700)
+        assert page.says('start') and page.says('end')
+
+
+def test_page_without_an_exercise_shows_none(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        assert page.evaluate("document.querySelector('#task').hidden")
+        assert not page.evaluate("document.querySelectorAll('.label.above').length")
+
+
+def colours(page: Page, points: np.ndarray) -> np.ndarray:
+    """Mean colour of the picture around places [m]."""
+    picture = page.picture().astype(float)
+    places = np.rint(page.pixels(points)).astype(int)
+    return np.array([picture[y - 1 : y + 2, x - 1 : x + 2].mean(axis=(0, 1)) for x, y in places])
+
+
+@pytest.mark.parametrize(
+    ('scene', 'line', 'beside'),
+    [
+        ('pad', [[0.0215, 0.0015], [0.0255, 0.0015]], 0.006),  # beside its dashes, in the band
+        ('vessel', [[-0.024, 0.005], [0.024, 0.005]], -0.006),  # in its hatching
+    ],
+)
+def test_target_and_zone_are_drawn_on_the_tissue_and_move_with_it(
+    browser: Browser, scene: str, line: list[list[float]], beside: float
+) -> None:
+    stand_in = StandIn(scene)
+    top = float(stand_in.positions[:, 2].max())
+    points = np.array([[*np.array(line[0]) * (1 - s) + np.array(line[1]) * s, top]
+                       for s in np.linspace(0.0, 1.0, 15)])  # fmt: skip
+    with opened(browser, stand_in) as page:
+        page.evaluate("document.querySelector('[data-view=top]').click()")
+        stand_in.tip[1] = stand_in.goal[1] = 0.05  # the tool is not over it
+        for shift in (0.0, 0.008):
+            stand_in.move(shift)
+            page.wait(
+                partial(drawn, page, points + np.array([0.0, shift, 0.0]), beside),
+                f'the ink {1000 * shift} mm along y',
+            )
+
+
+def drawn(page: Page, points: np.ndarray, beside: float) -> bool:
+    """Whether the ink is at these places and not beside them: it is less red than the tissue."""
+    inked, bare = (colours(page, at) for at in (points, points - np.array([0.0, beside, 0.0])))
+    share = (inked[:, 1] - 0.6 * inked[:, 0]) - (bare[:, 1] - 0.6 * bare[:, 0])
+    return bool((share > 12).mean() > 0.6)

@@ -20,6 +20,7 @@ from bench.page import stand_in as page_stand_in
 from bench.page.open_page import OpenPage, session_address
 from bench.page.stand_in import CONTROLS, GATE, VALID, StandIn, sheet, wave
 from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.session import demo_command
 from cutting_trainer.viewer.access_control import PageError, PageLimits
@@ -357,7 +358,7 @@ def test_server_leaves_no_thread_and_no_socket() -> None:
 def test_page_shows_no_folders_and_follows_what_the_launcher_says(
     stand_in: StandIn, page: OpenPage
 ) -> None:
-    live = LivePage(stand_in.server, ToolSettings(), CONTROLS)
+    live = LivePage(stand_in.server, ToolSettings(), ExerciseSettings(), CONTROLS)
     problem = 'no scene /home/somebody/x.yaml'
     live.show_session(SessionState('kidney', 'delete', 'bags/kidney-1', problem=problem))
     live.show_state('FAULT', 'the file /home/somebody/x.yaml is lacking', e_stopped=True)

@@ -125,7 +125,9 @@ def test_changed_tissue_goes_another_way(bag: Bag, scene: Scene, tmp_path: Path)
 
 @pytest.fixture
 def page(bag: Bag, scene: Scene, again: ComputedTissue) -> Iterator[ReplayPage]:
-    page = ReplayPage(bag, scene.tool, scene.device, again, 'computed again', LOCAL, 0, GATE)
+    page = ReplayPage(
+        bag, scene.tool, scene.device, scene.exercise, again, 'computed again', LOCAL, 0, GATE
+    )
     yield page
     page.server.stop()
 

@@ -1,10 +1,11 @@
-"""Appearance of a page: the drawn tool, the floor, the first camera."""
+"""Appearance of a page: the drawn tool, the floor, the first camera, the exercise."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cutting_trainer.exercises.scene_schema import BallSettings, ExerciseSettings
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.viewer.allowed_requests import Bounds
 from cutting_trainer.viewer.colours import TISSUE, Colour
@@ -26,6 +27,8 @@ _MIN_VIEW_M = 0.12
 """[m] Smallest view, however small the tissue: the tool has its own size."""
 _SPINE, _THICKNESS = 0.005, 0.0008
 """[m] Width and thickness of the blade as drawn."""
+_MAX_TITLE, _MAX_INSTRUCTION = 80, 300
+"""Characters that are shown."""
 _HANDLE, _RADIUS, _SIDES = 0.07, 0.0035, 24
 """[m] Length and radius of the handle as drawn; its sides."""
 
@@ -87,6 +90,36 @@ def shown_tissue(
         'label': label,
         'colour': colour,
         'offset': [offset, 0.0, 0.0],
+    }
+
+
+def shown_exercise(exercise: ExerciseSettings) -> dict[str, Any] | None:
+    """Return an exercise in the format of the message `hello`; None: the scene is none.
+
+    Lumps are hidden from the trainee, and so from the page. Curves, tubes and lesion are those of
+    the tissue at rest [m]; start and end are places of the tip.
+    """
+    if not exercise.title:
+        return None
+
+    def ball(settings: BallSettings | None) -> dict[str, Any] | None:
+        if settings is None:
+            return None
+        return {'centre': settings.centre, 'radius': settings.radius}
+
+    return {
+        'title': exercise.title[:_MAX_TITLE],
+        'instruction': exercise.instruction[:_MAX_INSTRUCTION],
+        'targets': [
+            {'points': np.round(target.corners(), 6).tolist(), 'margin': target.margin}
+            for target in exercise.targets
+        ],
+        'zones': [{'points': zone.points, 'radius': zone.radius} for zone in exercise.zones],
+        'lesion': ball(exercise.lesion),
+        'start': ball(exercise.start),
+        'end': ball(exercise.end),
+        'time_limit': exercise.time_limit,
+        'force_limit': exercise.force_limit,
     }
 
 

@@ -163,4 +163,5 @@ class TissueSource:
             cut_edges=self._drawn.cut_edges.points(
                 replica.rest + replica.displacement, _LIFT_M
             ).reshape(-1, 3),
+            rest=replica.rest[parts[OUTER].nodes, :2].astype(np.float32),
         )

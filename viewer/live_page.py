@@ -8,6 +8,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from cutting_trainer.cutting.scene_schema import CuttingSettings
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
@@ -19,9 +20,11 @@ from cutting_trainer.viewer.appearance import (
     METRES_PER_NEWTON,
     camera,
     reach,
+    shown_exercise,
     shown_tissue,
     tool_shape,
 )
+from cutting_trainer.viewer.attempt_progress import AttemptProgress
 from cutting_trainer.viewer.drawn_surface import TissueSource
 from cutting_trainer.viewer.page_protocol import MAX_NAME, VERSION
 from cutting_trainer.viewer.page_server import PageServer
@@ -90,11 +93,19 @@ class LivePage:
     Args:
         server: of the pages.
         tool: to draw.
+        exercise: to show.
         controls: allowed requests at the beginning.
     """
 
-    def __init__(self, server: PageServer, tool: ToolSettings, controls: LiveControls) -> None:
+    def __init__(
+        self,
+        server: PageServer,
+        tool: ToolSettings,
+        exercise: ExerciseSettings,
+        controls: LiveControls,
+    ) -> None:
         self._server, self._tool, self._controls = server, tool, controls
+        self._begin_exercise(exercise)
         self._source = TissueSource(TISSUE)
         self._history = History(4, _SAMPLES)
         self._gauge: SurfaceDepth | None = None
@@ -125,6 +136,7 @@ class LivePage:
             metres_per_newton=METRES_PER_NEWTON,
             tissues=[shown_tissue(TISSUE, '')],
             plots_span=PLOT_SPAN_S,
+            exercise=shown_exercise(self._exercise),
         )
 
     def _allow(self, **changes: object) -> None:
@@ -133,9 +145,15 @@ class LivePage:
             self._controls = changed
             self._server.allow(changed)
 
-    def equip(self, tool: ToolSettings) -> None:
-        """Replace the drawn tool, for another tissue."""
+    def equip(self, tool: ToolSettings, exercise: ExerciseSettings) -> None:
+        """Replace the drawn tool and the exercise, for another tissue."""
         self._tool, self._gauge = tool, None
+        self._begin_exercise(exercise)
+        self._server.put('attempt', rows=[], score=None)
+
+    def _begin_exercise(self, exercise: ExerciseSettings) -> None:
+        self._exercise = exercise
+        self._progress = AttemptProgress(exercise) if exercise.title else None
 
     def show(
         self,
@@ -167,10 +185,17 @@ class LivePage:
         if moment is not None and moment.is_finite:
             force, depth = float(np.linalg.norm(moment.force)), self._depth(moment)
             put_moment(self._server, moment, depth, can_guide=can_guide)
+            self._show_progress(now, replica, moment)
         self._history.add(now, force, depth, *rates)
         if now >= self._next_plot:
             self._next_plot = now + _PLOT_PERIOD_S
             self._plot()
+
+    def _show_progress(self, now: float, replica: MeshReplica, moment: Moment) -> None:
+        if self._progress is None or replica.revision < 0:
+            return
+        if (content := self._progress.see(now, replica, moment)) is not None:
+            self._server.put('attempt', **content)
 
     def _depth(self, moment: Moment) -> float:
         if self._gauge is None:

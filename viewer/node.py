@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from visualization_msgs.msg import MarkerArray
 
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.node_common import qos, ros
@@ -130,7 +131,7 @@ class ViewerNode(ManagedNode):
         self._link = link(host, self._server.port, names, gate.token)
         if not is_local(host):
             self._link += f' {OPEN_LINK_WARNING}'
-        self._page = LivePage(self._server, self._tool, controls)
+        self._page = LivePage(self._server, self._tool, self._exercise, controls)
         self._page.show_scale(self._force_scale)
 
     def _marker_colours(self) -> tuple[Any, float]:
@@ -148,6 +149,7 @@ class ViewerNode(ManagedNode):
         self._force_topic = f'{ros.ARM}/{device.force_topic}'
         self._translator = Translator(device)
         self._tool = read_section(scene, 'tool', ToolSettings)
+        self._exercise = read_section(scene, 'exercise', ExerciseSettings)
         haptics = read_section(scene, 'haptics', HapticsSettings)
         tissue = read_section(scene, 'tissue', TissueSettings)
         self._nominal = haptics.rate, tissue.integration.rate
@@ -288,7 +290,7 @@ class ViewerNode(ManagedNode):
         if answer.scene_file:
             self._take_scene(Path(answer.scene_file))
             self._frames.place(self._device)
-            self._page.equip(self._tool)
+            self._page.equip(self._tool, self._exercise)
             self._statuses.take_scale()
             self._page.show_scale(self._force_scale)
         if answer.busy:

@@ -10,7 +10,7 @@ the one before:
 
 | type | fields |
 |---|---|
-| hello | version, mode, title, session, scenes, methods, duration, speeds, tool, camera, floor, bounds, metres_per_newton, tissues, plots_span |
+| hello | version, mode, title, session, scenes, methods, duration, speeds, tool, camera, floor, bounds, metres_per_newton, tissues, plots_span, exercise: null where the scene is none |
 | controls | refused: sentence by op; every other op of the mode is allowed |
 | state | state, text, e_stopped |
 | nodes | rows of name, level, message, rate |
@@ -19,6 +19,7 @@ the one before:
 | moment | tip, wxyz, proxy, force, depth, can_guide, contact |
 | plots | span, lines of title, unit, times, values and colours by name, least |
 | playhead | time, playing, speed |
+| attempt | rows of name, value, over; score: null, or points, passed, reasons once the tip is back at the end |
 | notice | id, text |
 | refused | op, why: only to the page that asked |
 | pong | id: the same, age: of the newest session update [s] |
@@ -26,8 +27,9 @@ the one before:
 A tissue is binary. It begins with the length of a header as little-endian uint32, and the header
 as JSON, padded with spaces so that both have a multiple of 4 bytes. Each part follows with its
 positions, float32 (vertices, 3) [m], and, where `faces` is not null, its triangles, uint32
-(faces, 3). At the end are the edges of the cuts, float32 (cut_edges, 3). Null triangles mean that the
-page has them already.
+(faces, 3). At the end are the edges of the cuts, float32 (cut_edges, 3), and with new triangles x and y
+at rest of the outside's vertices, float32 (rest, 2): the page draws there what belongs to a place of
+the tissue. Null triangles mean that the page has them already.
 """  # noqa: E501
 
 import math

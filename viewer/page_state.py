@@ -23,6 +23,7 @@ class TissueFrame:
         positions: of each part's nodes [m], shape (n, 3), outer part first.
         faces: of each part, indices into its positions, shape (m, 3).
         cut_edges: ends of the edges along the cuts [m], shape (k, 3).
+        rest: x and y of the outer part's nodes at rest [m], shape (n, 2).
     """
 
     name: str
@@ -31,6 +32,7 @@ class TissueFrame:
     positions: tuple[NDArray[np.float32], ...]
     faces: tuple[NDArray[np.uint32], ...]
     cut_edges: NDArray[np.float32] = field(default_factory=lambda: NO_POSITIONS)
+    rest: NDArray[np.float32] = field(default_factory=lambda: NO_POSITIONS[:, :2])
 
     @cached_property
     def whole(self) -> bytes:
@@ -48,14 +50,16 @@ class TissueFrame:
             for kind, at, faces in zip(KINDS, self.positions, self.faces, strict=True)
         ]
         header = {'type': 'mesh', 'name': self.name, 'revision': self.revision}
-        text = json.dumps(header | {'parts': parts, 'cut_edges': len(self.cut_edges)}).encode()
+        rest = self.rest if with_faces else self.rest[:0]
+        counts = {'cut_edges': len(self.cut_edges), 'rest': len(rest)}
+        text = json.dumps(header | {'parts': parts} | counts).encode()
         text += b' ' * (-len(text) % 4)
         pieces = [len(text).to_bytes(4, 'little'), text]
         for at, faces in zip(self.positions, self.faces, strict=True):
             pieces.append(np.ascontiguousarray(at, '<f4').tobytes())
             if with_faces:
                 pieces.append(np.ascontiguousarray(faces, '<u4').tobytes())
-        pieces.append(np.ascontiguousarray(self.cut_edges, '<f4').tobytes())
+        pieces += [np.ascontiguousarray(last, '<f4').tobytes() for last in (self.cut_edges, rest)]
         return b''.join(pieces)
 
 

@@ -10,6 +10,7 @@ from cutting_trainer.bags.playback_control import Playhead
 from cutting_trainer.bags.playback_messages import duration
 from cutting_trainer.bags.reader import Bag
 from cutting_trainer.bags.recorded_indexings import indexing_at
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings
 from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
 from cutting_trainer.viewer.access_control import Gate
@@ -19,6 +20,7 @@ from cutting_trainer.viewer.appearance import (
     METRES_PER_NEWTON,
     TISSUE_SPACING,
     camera,
+    shown_exercise,
     shown_tissue,
     tool_shape,
 )
@@ -46,7 +48,7 @@ class ReplayPage:
 
     Args:
         bag: to read.
-        tool, device: sections of its scene.
+        tool, device, exercise: sections of its scene.
         computed: a tissue to show beside the recorded one; None: none.
         name: of the computed tissue.
         host, port: address of the page.
@@ -62,6 +64,7 @@ class ReplayPage:
         bag: Bag,
         tool: ToolSettings,
         device: DeviceSettings,
+        exercise: ExerciseSettings,
         computed: ComputedTissue | None,
         name: str,
         host: str,
@@ -80,10 +83,12 @@ class ReplayPage:
         self._asked = Requests()
         controls = ReplayControls(self._end, SPEEDS)
         self.server = PageServer(host, port, gate, 'replay', controls, self._ask)
-        self._hello(first.positions(), tool, name)
+        self._hello(first.positions(), tool, exercise, name)
         self._plot(name)
 
-    def _hello(self, positions: Floats, tool: ToolSettings, name: str) -> None:
+    def _hello(
+        self, positions: Floats, tool: ToolSettings, exercise: ExerciseSettings, name: str
+    ) -> None:
         apart = TISSUE_SPACING * float(np.ptp(positions[:, 0]))
         tissues = [shown_tissue(RECORDED, 'recorded' if self._computed else '')]
         seen = [positions]
@@ -107,6 +112,7 @@ class ReplayPage:
             metres_per_newton=METRES_PER_NEWTON,
             tissues=tissues,
             plots_span=self._end,
+            exercise=shown_exercise(exercise),
         )
 
     def _plot(self, name: str) -> None:

@@ -108,7 +108,7 @@ class OpenPage:
             self._listens(content)
 
     def _take_tissue(self, data: bytes) -> None:
-        header, parts, _ = read_tissue(data)
+        header, parts, _, _ = read_tissue(data)
         self.counts['mesh'] += 1
         self.updates += 1
         self.faces += parts[0][1] is not None
@@ -117,8 +117,10 @@ class OpenPage:
             self.newest = parts[0][0]
 
 
-def read_tissue(data: bytes) -> tuple[dict[str, Any], list[tuple[Any, Any]], np.ndarray]:
-    """Return header, positions and faces of each part, and cut edges of a binary message."""
+def read_tissue(
+    data: bytes,
+) -> tuple[dict[str, Any], list[tuple[Any, Any]], np.ndarray, np.ndarray]:
+    """Return header, parts (positions, faces), cut edges and places at rest of a binary message."""
     at = 4 + int.from_bytes(data[:4], 'little')
     assert at % 4 == 0
     header = json.loads(data[4:at])
@@ -132,8 +134,10 @@ def read_tissue(data: bytes) -> tuple[dict[str, Any], list[tuple[Any, Any]], np.
             at += faces.nbytes
         parts.append((positions, faces))
     cut_edges = np.frombuffer(data, '<f4', 3 * header['cut_edges'], at).reshape(-1, 3)
-    assert at + cut_edges.nbytes == len(data)
-    return header, parts, cut_edges
+    at += cut_edges.nbytes
+    rest = np.frombuffer(data, '<f4', 2 * header['rest'], at).reshape(-1, 2)
+    assert at + rest.nbytes == len(data)
+    return header, parts, cut_edges, rest
 
 
 class OtherProcess:

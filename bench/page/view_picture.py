@@ -26,7 +26,7 @@ def main() -> None:
     given = parser.parse_args()
     bag, scene = open_bag(given.bag), load_scene(given.scene)
     gate = make_gate(LOCAL, [])
-    page = ReplayPage(bag, scene.tool, scene.device, None, '', LOCAL, 0, gate)
+    page = ReplayPage(bag, scene.tool, scene.device, scene.exercise, None, '', LOCAL, 0, gate)
     page.seek(duration(bag) if given.at is None else given.at)
     ended: list[bool] = []
     Thread(target=page.run, args=(lambda: bool(ended),), daemon=True).start()

@@ -15,3 +15,10 @@ export const GHOST = 0xffd166; // of a tool that follows another
 
 // Line from the tip to the surface
 export const ABOVE = 0xe8f1f8, BELOW = 0xffd166;
+
+// Exercise: ink on the tissue
+export const TARGET = '#0a3d91'; // line to be cut
+export const BAND = 'rgba(255, 246, 228, 0.42)', BAND_EDGE = 'rgba(255, 250, 240, 0.9)'; // its margin
+export const ZONE = 'rgba(250, 200, 0, 0.62)', HATCH = 'rgba(20, 12, 4, 0.9)'; // not to be cut
+export const LESION = 'rgba(70, 40, 60, 0.45)', DOTS = 'rgba(36, 14, 40, 0.9)';
+export const ENDS = 0xf4f8fb; // of the tip's way

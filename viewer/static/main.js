@@ -7,6 +7,7 @@ import { decodeMesh } from './mesh.js';
 import { Notices } from './notices.js';
 import { Plots } from './plots.js';
 import { Stop } from './stop.js';
+import { Task } from './task.js';
 import { TimeLine } from './timeline.js';
 
 const $ = (id) => document.getElementById(id);
@@ -26,6 +27,7 @@ const send = (message) => {
 const controls = new Controls(send);
 const stop = new Stop($('e-stop'), $('reset-e-stop'), connection, (text) => notices.say(text, 'bad'));
 const timeline = new TimeLine(send);
+const task = new Task();
 new Gamepad(() => guide, () => stop.active && stop.press());
 let plots = new Plots($('plots'), null);
 
@@ -58,6 +60,7 @@ const takers = {
     allowGuide();
     guide?.show();
   },
+  attempt: (message) => task.show(message),
   plots: (message) => {
     seen.plots += 1;
     plots.show(message);
@@ -109,6 +112,7 @@ function begin(hello) {
   }
   controls.begin(hello);
   timeline.begin(hello);
+  task.begin(hello.exercise);
   onStage(() => {
     stage.begin(hello);
     guide.bounds = hello.bounds ?? null;

@@ -1,8 +1,8 @@
-// Decodes the binary message of a tissue: a header in JSON, then positions, faces and cut edges.
+// Decodes the binary message of a tissue: a header in JSON, then positions, faces, cut edges, and x and y at rest.
 
 const KINDS = ['outer', 'cut'];
 
-/** @returns {{name, revision, parts: Object<string, {positions, faces}>, cutEdges: Float32Array}} */
+/** @returns {{name, revision, parts: Object<string, {positions, faces}>, cutEdges: Float32Array, rest: Float32Array}} */
 export function decodeMesh(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   if (length > buffer.byteLength - 4) throw new RangeError('the header is longer than the message');
@@ -24,5 +24,6 @@ export function decodeMesh(buffer) {
     parts[part.kind] = { positions, faces };
   }
   const cutEdges = take(Float32Array, 3 * (header.cut_edges ?? 0));
-  return { name: header.name, revision: header.revision, parts, cutEdges };
+  const rest = take(Float32Array, 2 * (header.rest ?? 0));
+  return { name: header.name, revision: header.revision, parts, cutEdges, rest };
 }

@@ -4,6 +4,7 @@ import {
   DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
 } from './vendor/three.module.min.js';
 import { OrbitControls } from './vendor/OrbitControls.js';
+import { Ends, inkOf } from './exercise.js';
 import { Floor } from './floor.js';
 import { RelaxedSurface } from './relaxed_surface.js';
 import { TipMarks } from './tip_marks.js';
@@ -51,6 +52,9 @@ export class Stage {
     this.proxy = new Proxy(this.scene);
     this.arrow = new Arrow(this.scene);
     this.marks = new TipMarks(this.scene);
+    this.ends = new Ends(this.scene);
+    this._ink = null;
+    this._exercise = 'null'; // as text, to see whether it is another one
     this.surface = new RelaxedSurface();
     this._shown = null; // name of the tissue that the tool is in
     this.tissues = new Map();
@@ -61,7 +65,7 @@ export class Stage {
     this._ratioDrawn = this._full;
     this._home = null;
     this._radius = 0.002;
-    this._labels = new Map();
+    this._labels = [];
     new ResizeObserver(() => this._resize()).observe(place);
     this._resize();
   }
@@ -86,7 +90,8 @@ export class Stage {
     // Kept tissues keep their faces: the server does not send them again.
     for (const tissue of hello.tissues) this._tissue(tissue.name).look(tissue);
     this._shown = names[0];
-    this._label(hello.tissues);
+    this._label(hello.tissues, this.ends.show(hello.exercise));
+    this._inkTissues(hello.exercise);
     this.tool.equip(hello.tool);
     this._radius = hello.tool.radius;
     if (hello.camera !== null) this._frame(hello.camera);
@@ -96,6 +101,16 @@ export class Stage {
     this.floor.lay({ z: hello.floor?.z ?? 0, size, centre });
     this._shade();
     this.invalidate();
+  }
+
+  _inkTissues(exercise) {
+    const text = JSON.stringify(exercise);
+    if (text !== this._exercise) {
+      this._ink?.dispose();
+      this._ink = inkOf(exercise);
+    }
+    this._exercise = text;
+    for (const tissue of this.tissues.values()) tissue.draw(this._ink);
   }
 
   _tissue(name) {
@@ -236,31 +251,33 @@ export class Stage {
     this.invalidate();
   }
 
-  _label(tissues) {
-    for (const { element } of this._labels.values()) element.remove();
-    this._labels.clear();
-    for (const { name, label } of tissues) {
-      if (!label) continue;
+  _label(tissues, ends) {
+    for (const { element } of this._labels) element.remove();
+    const below = ({ name }) => () => {
+      const box = this.tissues.get(name)?.box() ?? null;
+      return box && new Vector3((box.min.x + box.max.x) / 2, box.min.y, box.min.z);
+    };
+    const named = [
+      ...tissues.filter(({ label }) => label).map((tissue) => ({ text: tissue.label, kind: 'below', at: below(tissue) })),
+      ...ends.map(({ text, place }) => ({ text, kind: 'above', at: () => place.clone() })),
+    ];
+    this._labels = named.map(({ text, kind, at }) => {
       const element = document.createElement('span');
-      element.className = 'label';
-      element.textContent = label;
+      element.className = `label ${kind}`;
+      element.textContent = text;
       this._place.append(element);
-      this._labels.set(name, { element });
-    }
+      return { element, at };
+    });
   }
 
   _placeLabels() {
-    for (const [name, { element }] of this._labels) {
-      const tissue = this.tissues.get(name);
-      const box = tissue?.box() ?? null;
-      element.hidden = box === null;
-      if (box === null) continue;
-      const point = new Vector3((box.min.x + box.max.x) / 2, box.min.y, box.min.z);
-      const place = point.project(this.camera);
+    for (const { element, at } of this._labels) {
+      const place = at()?.project(this.camera) ?? null;
+      element.hidden = place === null || place.z >= 1;
+      if (element.hidden) continue;
       const x = (0.5 + 0.5 * place.x) * this._place.clientWidth;
       const y = (0.5 - 0.5 * place.y) * this._place.clientHeight;
-      element.hidden = place.z >= 1;
-      element.style.transform = `translate(${x}px, ${y + 8}px) translateX(-50%)`;
+      element.style.transform = `translate(${x}px, ${y}px)`;
     }
   }
 }

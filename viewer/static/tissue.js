@@ -26,6 +26,7 @@ export class TissueView {
       this.group.add(mesh);
       this.parts[kind] = mesh;
     }
+    this.parts.outer.material.onBeforeCompile = inked;
     this.cutEdges = new Mesh(new BufferGeometry(), new MeshBasicMaterial({ color: CORE }));
     const wet = { color: BLOOD, specular: 0xffffff, shininess: 120, map: fadedBand(), transparent: true, depthWrite: false, side: 2 };
     this.blood = new Mesh(new BufferGeometry(), new MeshPhongMaterial(wet));
@@ -45,6 +46,13 @@ export class TissueView {
     this.group.position.fromArray(offset);
   }
 
+  /** Takes the ink on the outside, a texture by x and y at rest; null: none. */
+  draw(ink) {
+    const { material } = this.parts.outer;
+    material.map = ink;
+    material.needsUpdate = true;
+  }
+
   /** The next positions are those of the whole tissue. */
   forget() {
     this.first = null;
@@ -58,7 +66,7 @@ export class TissueView {
   /** Updates positions, and faces where there are new ones. */
   update(mesh) {
     this.revision = mesh.revision;
-    for (const [kind, part] of Object.entries(mesh.parts)) this._part(kind, part);
+    for (const [kind, part] of Object.entries(mesh.parts)) this._part(kind, part, mesh.rest);
     this._showCutEdges(mesh.cutEdges);
     if (this.first === null && mesh.parts.outer?.positions.length > 0) {
       this.first = new Box3().setFromArray(mesh.parts.outer.positions);
@@ -88,7 +96,7 @@ export class TissueView {
     }
   }
 
-  _part(kind, { positions, faces }) {
+  _part(kind, { positions, faces }, rest) {
     const mesh = this.parts[kind];
     if (faces !== null) {
       mesh.geometry.dispose();
@@ -98,6 +106,7 @@ export class TissueView {
       if (kind === 'outer') {
         mesh.geometry.setAttribute('normal', dynamic(new Float32Array(positions.length)));
         mesh.geometry.setAttribute('color', new BufferAttribute(mottle(positions), 3));
+        mesh.geometry.setAttribute('uv', new BufferAttribute(rest.slice(), 2));
       } else {
         mesh.geometry.setAttribute('color', dynamic(new Float32Array(positions.length).fill(1)));
       }
@@ -151,6 +160,18 @@ export class TissueView {
     position.needsUpdate = normal.needsUpdate = true;
   }
 
+}
+
+/** Lays the map over the mottled colour, in place of a product of both. */
+function inked(shader) {
+  shader.fragmentShader = shader.fragmentShader.replace('#include <map_fragment>', '').replace(
+    '#include <color_fragment>',
+    `#include <color_fragment>
+    #ifdef USE_MAP
+      vec4 ink = texture2D(map, vMapUv);
+      diffuseColor.rgb = mix(diffuseColor.rgb, ink.rgb, ink.a);
+    #endif`,
+  );
 }
 
 /** A texture across the band: opaque in the middle, gone at its sides. */
