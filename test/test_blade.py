@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from meshes import box
 
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep, points_of
 from cutting_trainer.tissue_sim.contact.immersion import (
     POINTS,
@@ -292,3 +294,11 @@ def test_points_of_an_edge_are_found_where_a_look_at_every_element_finds_them() 
             if tet >= 0:
                 assert least[tet] >= -1e-9
                 np.testing.assert_allclose(weight @ mesh.rest[mesh.tetrahedra[tet]], point)
+
+
+@pytest.mark.parametrize('scene', ['circle', 'excision'])
+def test_a_thin_sheet_under_tension_begins_at_rest(scene: str) -> None:
+    simulation, _ = make_simulation(load_scene(scene).tissue)
+    before = simulation.displacement.copy()
+    simulation.frame(None)
+    np.testing.assert_allclose(simulation.displacement, before, atol=1e-9)

@@ -15,7 +15,6 @@ from cutting_trainer.tissue_sim.contact.coupling import (
 )
 from cutting_trainer.tissue_sim.contact.cut_contact import NO_CUT_CONTACTS, CutContact, CutContacts
 from cutting_trainer.tissue_sim.contact.cut_contact_search import NO_NEAR_FACES, NearFaces
-from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.equilibrium import equilibrium
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
@@ -201,19 +200,7 @@ class Dynamics:
         middle = self.mesh.rest[fixed].mean(axis=0)
         u = self.displacement
         u[:] = (self.mesh.rest - middle) * stretch
-        if self.model.lawful:
-            # Steps with the linear stiffness diverge where the law counts.
-            u[:] = equilibrium(self.model, np.zeros_like(u), start=u, tolerance=1e-9)
-            self.restart()
-            return
-        first = 0.0
-        for _ in range(50 if self.model.rotating else 1):
-            residual = -self.model.force(u)
-            size = float(np.linalg.norm(residual[~fixed]))
-            first = first or size
-            if size < 1e-10 * first:
-                break
-            u[~fixed] += solve_static(self.model, self.inverse_mass > 0, residual)[~fixed]
+        u[:] = equilibrium(self.model, np.zeros_like(u), start=u, tolerance=1e-9)
         self.restart()
 
     def settle(self) -> None:
