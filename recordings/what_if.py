@@ -252,13 +252,15 @@ def recorded_run(bag: Bag, computed: Resimulation) -> tuple[Run, int | None]:
         SessionError: the bag has no poses, or no forces of the hand.
     """
     records, poses = computable_poses(bag)
-    return recompute(records, recorded_force(bag, poses), computed)
+    differs = recompute(records, computed)
+    return as_felt(recorded_force(bag, poses), computed), differs
 
 
-def recompute(
-    records: Sequence[FrameRecord], felt: RecordedForce, computed: Resimulation
-) -> tuple[Run, int | None]:
+def recompute(records: Sequence[FrameRecord], computed: Resimulation) -> int | None:
     """Recompute the tissue under frames already read, as `recorded_run` does.
+
+    Returns:
+        The first frame whose force differs from the recorded one; None: there is none.
 
     Raises:
         BagError: a frame cannot be recomputed.
@@ -270,7 +272,12 @@ def recompute(
         off = float(np.abs(frame.force - was).max())
         if differs is None and off > MAX_ROUNDING * np.abs(was).max():
             differs = record.step
-    return _run(felt.times, felt.forces, felt.contact, computed), differs
+    return differs
+
+
+def as_felt(felt: RecordedForce, computed: Resimulation) -> Run:
+    """Return a recomputed session with the recorded force on the hand."""
+    return _run(felt.times, felt.forces, felt.contact, computed)
 
 
 def recorded_force(bag: Bag, poses: Sequence[StampedMessage]) -> RecordedForce:

@@ -1,4 +1,4 @@
-"""Who makes an attempt, and which one it is: what a session writes into its bag."""
+"""Who makes an attempt, and which one it is, for the bag of a session."""
 
 import sqlite3
 from pathlib import Path
@@ -28,7 +28,7 @@ def open_store(folder: Path) -> AttemptStore:
 
 
 def attempt_data(folder: Path, exercise: str, subject: str, notes: str) -> dict[str, str]:
-    """Return what the bag of an attempt says about it.
+    """Return the entries of an attempt in its bag.
 
     Args:
         folder: where the bag goes.

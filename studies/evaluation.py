@@ -30,6 +30,7 @@ from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation
 from cutting_trainer.recordings.what_if import (
     RecordedForce,
+    as_felt,
     computable_poses,
     move_hand,
     recompute,
@@ -169,7 +170,8 @@ def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int]:
     if changed:
         run = move_hand(recording.records, recording.poses, recording.indexings, scene, computed)
     else:
-        run, differs = recompute(recording.records, felt, computed)
+        differs = recompute(recording.records, computed)
+        run = as_felt(felt, computed)
     return outputs_of(run, felt.forces, computed.simulation.mesh), differs or 0
 
 

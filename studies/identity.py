@@ -1,4 +1,4 @@
-"""Identity of what computes a row: code, kernels, libraries, machine."""
+"""Identity of a worker: code, kernels, libraries, machine."""
 
 from dataclasses import dataclass, fields
 from functools import cache

@@ -147,7 +147,7 @@ def run_study(options: StudyOptions) -> Status:
 
 
 def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
-    """Compute what is left of a study; return False where it was interrupted."""
+    """Compute the rest of a study; return False where it was interrupted."""
     jobs = plan.jobs()
     done = plan.size - len(jobs)
     if plan.journal.outdated:

@@ -242,7 +242,7 @@ def test_worker_that_dask_gives_up_is_started_anew() -> None:
     # It does so where a worker is killed again before it is back: such a study had no end.
     with own_cluster(1) as client:
         (before,) = client.nthreads()
-        nanny = client.cluster.workers[0]
+        (nanny,) = client.cluster.workers.values()
         client.sync(nanny.close)
         until = time.monotonic() + _TIMEOUT_S
         while not client.nthreads() or before in client.nthreads():

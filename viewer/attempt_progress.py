@@ -19,7 +19,7 @@ _MAX_REASONS = 6
 
 
 class AttemptProgress:
-    """Follows an attempt by what the page shows, up to 30 times a second.
+    """Follows an attempt by the samples of the page, up to 30 times a second.
 
     Its peak of the force is that of these samples: a shorter peak is in the bag alone.
 

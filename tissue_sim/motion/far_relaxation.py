@@ -1,4 +1,4 @@
-"""Relaxation of far nodes along what the unknowns of the coarse grid cannot answer.
+"""Relaxation of far nodes along the forces that the unknowns of the coarse grid cannot answer.
 
 The unknowns carry the smooth part of the far field, and steps of descent find the rest, as the
 smoother of a multigrid method does (Brandt 1977). They only take energy away, and no velocity is
