@@ -1,5 +1,6 @@
 """Guided set-up: where a device is, by touches of known points, written to a scene."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from io import StringIO
@@ -225,6 +226,7 @@ def write_placement(scene: Scene, placement: Placement) -> None:
     yaml.dump(content, out)
     part = scene.path.with_name(f'.{scene.path.name}.part')
     part.write_text(out.getvalue(), encoding='utf-8')
+    shutil.copymode(scene.path, part)
     part.replace(scene.path)
 
 

@@ -139,6 +139,13 @@ def test_the_scene_keeps_all_but_where_the_device_is(tmp_path):
     assert path.read_text().splitlines() == after
 
 
+def test_the_scene_stays_as_private_as_it_was(tmp_path):
+    path = own_scene(tmp_path)
+    path.chmod(0o600)
+    write_placement(load_scene(str(path)), place(SHEET, SHEET))
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
 def test_a_scene_without_the_section_gets_it(tmp_path):
     path = own_scene(tmp_path)
     lines = path.read_text().splitlines()

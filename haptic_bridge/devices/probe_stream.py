@@ -114,7 +114,8 @@ def _jitter(poses: Poses, topic: str) -> ProbeCheck:
         'wrong',
         measured,
         f'{topic} was silent for {1e3 * gaps.max():.0f} ms, and the bridge enters FAULT after '
-        f'{1e3 * MAX_GAP_S:g}: give the driver real-time priority (chrt -f 20) or a quieter machine',
+        f'{1e3 * MAX_GAP_S:g}: give the driver real-time priority (chrt -f 20), or a quieter '
+        'machine',
     )
 
 
