@@ -160,7 +160,7 @@ class Guide:
 
     def write(self, checks: Sequence[ProbeCheck]) -> ProbeCheck:
         """Write the placement to the scene, if nothing is wrong; return the result."""
-        wrong = [c.name for c in checks if c.verdict == 'wrong' and c.name not in _OF_TIME]
+        wrong = hindrances(checks)
         if self.found is None or wrong:
             why = f'because of {", ".join(wrong)}' if wrong else 'because the turn was not seen'
             return ProbeCheck('scene', 'wrong', 'not written', f'nothing was written {why}')
@@ -172,6 +172,11 @@ class Guide:
         worst = 1e3 * self.found.residuals.max()
         measured = f'turned by {rpy} deg, scale {self.found.scale:.3f}, within {worst:.1f} mm'
         return ProbeCheck('scene', 'ok', f'{measured}; written to {self.scene.path}')
+
+
+def hindrances(checks: Sequence[ProbeCheck]) -> list[str]:
+    """Return the names of the checks by which a placement would not be right."""
+    return [c.name for c in checks if c.verdict == 'wrong' and c.name not in _OF_TIME]
 
 
 def _turned(position: list[float]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import pytest
 import rclpy
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from bench.figures.arms_placement import PlacedDevice, set_up
@@ -23,7 +24,7 @@ from cutting_trainer.haptic_bridge.devices.placement import (
     why_no_touch,
 )
 from cutting_trainer.haptic_bridge.devices.probe_node import DeviceProbe
-from cutting_trainer.haptic_bridge.devices.probe_stream import ProbeCheck
+from cutting_trainer.haptic_bridge.devices.probe_stream import Poses, ProbeCheck
 from cutting_trainer.haptic_bridge.scene_schema import SettingsError, Transform
 from cutting_trainer.node_common.orientation import from_rpy
 from cutting_trainer.session import probe_command as command
@@ -179,6 +180,19 @@ def test_a_late_stream_does_not_stop_the_writing_and_a_wrong_unit_does(tmp_path)
     assert guide.write(late).verdict == 'ok'
     found = load_scene(str(guide.scene.path)).device.tissue_from_device
     np.testing.assert_allclose(found.translation, (-0.01, 0, 0), atol=1e-6)
+
+
+def test_no_touch_is_asked_for_where_nothing_could_be_written(tmp_path, capsys):
+    times = np.arange(0, 3, 1e-3)
+    poses = Poses(times, times, np.full((len(times), 7), np.nan))
+    node = mock.Mock(pose_topic='/bad/measured_cp', frames={'base'})
+    node.find.return_value = ProbeCheck('publisher', 'ok', 'one, reliable')
+    node.listen.return_value = poses
+    guide = Guide.of(str(own_scene(tmp_path)))
+    checks = command._checks(node, ProbeOptions(), guide.profile, Console(stderr=True), guide)
+    node.await_touch.assert_not_called()
+    assert 'Touch' not in capsys.readouterr().err
+    assert 'values' in guide.write(checks).sentence
 
 
 def test_a_driver_that_dies_between_two_touches_is_named():
