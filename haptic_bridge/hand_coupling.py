@@ -8,6 +8,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import ValidationError
 
 from cutting_trainer.haptic_bridge import force_kernels
 from cutting_trainer.haptic_bridge.indexing import Indexing, scaled
@@ -15,6 +16,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
     DeviceSettings,
     HapticsSettings,
+    SettingsError,
     ToolSettings,
     check_together,
 )
@@ -94,8 +96,8 @@ class HandCoupling:
             clutched: whether the hand moves without the tool, and without force.
 
         Raises:
-            SettingsError: the coupling would be stiffer than the device bears.
-            ValidationError: a scale is out of range.
+            SettingsError: a scale is out of range, or the coupling would be stiffer than the device
+                bears.
         """
         order = self.check(force_scale=force_scale, motion_scale=motion_scale)
         self._order = order if clutched is None else order._replace(clutched=clutched)
@@ -107,10 +109,16 @@ class HandCoupling:
         order = self._order
         if force_scale is not None:
             values = order.haptics.model_dump() | {'force_scale': force_scale}
-            order = order._replace(haptics=HapticsSettings.model_validate(values))
+            try:
+                order = order._replace(haptics=HapticsSettings.model_validate(values))
+            except ValidationError as error:
+                raise _out_of_range('force_scale', force_scale, error) from None
         if motion_scale is not None:
             order = order._replace(motion_scale=motion_scale)
-        device = scaled(self._device, order.motion_scale)
+        try:
+            device = scaled(self._device, order.motion_scale)
+        except ValidationError as error:
+            raise _out_of_range('motion_scale', order.motion_scale, error) from None
         check_together(self._tool, device, order.haptics, self._profile)
         return order
 
@@ -153,3 +161,9 @@ class HandCoupling:
         self.setup = force_kernels.make_setup(
             self._tool, device, order.haptics, self._profile, self._steps, self.indexing
         )
+
+
+def _out_of_range(name: str, value: float, error: ValidationError) -> SettingsError:
+    """Return the reason without the model's name and the link that pydantic adds."""
+    reason = error.errors()[0]['msg']
+    return SettingsError(f'{name} is {value:g}: {reason[0].lower()}{reason[1:]}')

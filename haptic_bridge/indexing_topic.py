@@ -2,10 +2,10 @@
 
 import time
 
-from cutting_trainer_msgs.msg import Indexing as IndexingMessage
+from cutting_trainer_msgs.msg import Indexing
 
 from cutting_trainer.haptic_bridge.hand_coupling import HandCoupling
-from cutting_trainer.haptic_bridge.indexing import Indexing
+from cutting_trainer.haptic_bridge.indexing import Indexing as HandIndexing
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.lifecycle import ManagedNode
 
@@ -20,7 +20,7 @@ class IndexingTopic:
 
     def __init__(self, node: ManagedNode, coupling: HandCoupling) -> None:
         self._unsent = coupling.unsent
-        self._publisher = node.create_publisher(IndexingMessage, ros.INDEXING, qos.HISTORY)
+        self._publisher = node.create_publisher(Indexing, ros.INDEXING, qos.HISTORY)
         self._publish(coupling.indexing._replace(after_ns=time.time_ns()))
 
     def publish_changes(self) -> None:
@@ -28,9 +28,9 @@ class IndexingTopic:
         while self._unsent:
             self._publish(self._unsent.popleft())
 
-    def _publish(self, indexing: Indexing) -> None:
+    def _publish(self, indexing: HandIndexing) -> None:
         values = indexing._asdict()
-        message = IndexingMessage()
+        message = Indexing()
         message.header.frame_id = ros.FRAME
         message.header.stamp = ros.stamp(values.pop('after_ns'))
         for name, value in values.items():

@@ -5,6 +5,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from cutting_trainer_msgs.msg import Contact
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -72,7 +73,8 @@ CLOCK_STEP_NS = 1_000_000
 
 BUTTON, CLUTCH = 'button', 'clutch'
 """Topics of buttons below `arm`."""
-SETTABLE = ('force_scale', 'motion_scale', 'tool_mode')
+SCALES = ('force_scale', 'motion_scale')
+SETTABLE = (*SCALES, 'tool_mode')
 """Parameters that may change while the node runs."""
 MODES = {mode.name.lower(): mode for mode in ToolMode}
 """Modes of the tool by the names that a scene and the parameter give them."""
@@ -244,22 +246,21 @@ class HapticBridge(ManagedNode):
             if given.name not in SETTABLE:
                 reason = f'{given.name} is read only at the start of the node'
                 return SetParametersResult(successful=False, reason=reason)
-            try:
+        try:
+            for given in parameters:
                 if given.name == 'tool_mode':
                     mode_of(given.value)
-                else:
-                    self._path.coupling.check(**{given.name: given.value})
-            except ValueError as error:
-                reason = ' '.join(str(error).split())
-                return SetParametersResult(successful=False, reason=reason)
+            self._path.coupling.check(**scales_of(parameters))
+        except ValueError as error:
+            reason = ' '.join(str(error).split())
+            return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
     def _use_parameters(self, parameters: list[Parameter]) -> None:
+        self._path.coupling.change(**scales_of(parameters))
         for given in parameters:
             if given.name == 'tool_mode':
                 self._path.next_mode = mode_of(given.value)
-            elif given.name in SETTABLE:
-                self._path.coupling.change(**{given.name: given.value})
 
     def _change_mode(self, pressed: bool) -> None:
         """Make a palpator of the scalpel, or close the jaws of a grasper, and back."""
@@ -419,6 +420,11 @@ def mode_of(name: object) -> ToolMode:
     if name not in MODES:
         raise ValueError(f'tool_mode is {name!r:.40}: it must be {" or ".join(MODES)}')
     return MODES[str(name)]
+
+
+def scales_of(parameters: list[Parameter]) -> dict[str, Any]:
+    """Return the scales among parameters; both together make the coupling stiff."""
+    return {given.name: given.value for given in parameters if given.name in SCALES}
 
 
 def of_tissue(scene: Path) -> tuple[float, Friction, Steps]:

@@ -1,5 +1,6 @@
 """Guided set-up: where a device is, by touches of known points, written to a scene."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from io import StringIO
@@ -38,6 +39,8 @@ MOVE_TIMEOUT_S = 30.0
 CORNERS = ('front left', 'front right', 'back right', 'back left')
 _DIGITS = 6
 _NAME = 'placement'
+_OF_TIME = ('rate', 'jitter', 'age')
+"""Checks that say nothing about where a tip at rest is."""
 
 
 @dataclass
@@ -157,7 +160,7 @@ class Guide:
 
     def write(self, checks: Sequence[ProbeCheck]) -> ProbeCheck:
         """Write the placement to the scene, if nothing is wrong; return the result."""
-        wrong = [check.name for check in checks if check.verdict == 'wrong']
+        wrong = hindrances(checks)
         if self.found is None or wrong:
             why = f'because of {", ".join(wrong)}' if wrong else 'because the turn was not seen'
             return ProbeCheck('scene', 'wrong', 'not written', f'nothing was written {why}')
@@ -169,6 +172,11 @@ class Guide:
         worst = 1e3 * self.found.residuals.max()
         measured = f'turned by {rpy} deg, scale {self.found.scale:.3f}, within {worst:.1f} mm'
         return ProbeCheck('scene', 'ok', f'{measured}; written to {self.scene.path}')
+
+
+def hindrances(checks: Sequence[ProbeCheck]) -> list[str]:
+    """Return the names of the checks by which a placement would not be right."""
+    return [c.name for c in checks if c.verdict == 'wrong' and c.name not in _OF_TIME]
 
 
 def _turned(position: list[float]) -> dict[str, Any]:
@@ -223,6 +231,7 @@ def write_placement(scene: Scene, placement: Placement) -> None:
     yaml.dump(content, out)
     part = scene.path.with_name(f'.{scene.path.name}.part')
     part.write_text(out.getvalue(), encoding='utf-8')
+    shutil.copymode(scene.path, part)
     part.replace(scene.path)
 
 

@@ -43,7 +43,7 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.node_commands import ARM_NODE, arm_command, node_environment
 from cutting_trainer.session.node_process import NodeProcess
-from cutting_trainer.session.place_device import MOVE_TIMEOUT_S, Guide
+from cutting_trainer.session.place_device import MOVE_TIMEOUT_S, Guide, hindrances
 
 REST_TIME_S = 3.0
 """Time of recording the arm at rest [s]."""
@@ -160,6 +160,8 @@ def _checks(
         return [*checks, ProbeCheck('rate', 'wrong', 'silent', silent)]
     scaled = replace(poses, values=poses.values * [*[options.metres] * 3, 1.0, 1.0, 1.0, 1.0])
     checks += check_stream(scaled, profile, node.pose_topic)
+    if guide is not None and hindrances(checks):
+        return checks
     if guide is not None:
         if options.emulation is not None:
             node.enable()

@@ -101,7 +101,7 @@ def offered() -> dict[str, QoSProfile]:
 
 def test_reference_says_the_qos_that_is_offered() -> None:
     told = {t.name: t.qos for t in topic_reference.TOPICS}
-    asked_for = {name for name in told if name.endswith('/state_command')}
+    asked_for = {name for name in told if name.endswith(('/state_command', '/clutch'))}
     seen = offered()
     assert told.keys() - asked_for <= seen.keys()
     for name in told.keys() - asked_for:

@@ -12,12 +12,15 @@ import pytest
 import rclpy
 from hypothesis import given
 from hypothesis import strategies as st
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Joy
 
 from cutting_trainer.haptic_bridge.device_button import DeviceButton
 from cutting_trainer.haptic_bridge.force_kernels import STATE
+from cutting_trainer.haptic_bridge.hand_coupling import Order
 from cutting_trainer.haptic_bridge.node import HapticBridge
+from cutting_trainer.haptic_bridge.scene_schema import SettingsError
 from cutting_trainer.node_common.crtk import REPLY_PERIOD_S
 from cutting_trainer.node_common.lifecycle import Stop
 from cutting_trainer.node_common.operating_state import (
@@ -322,6 +325,35 @@ def test_of_a_request_that_is_refused_nothing_is_used(bridge: HapticBridge):
     assert bridge._path.haptics.force_scale == 1.0
     assert bridge.set_parameters_atomically(request[:1]).successful
     assert bridge._path.haptics.force_scale == 1.5
+
+
+def test_two_scales_of_one_request_count_together(bridge: HapticBridge):
+    def ask(force: float, motion: float) -> SetParametersResult:
+        given = {'force_scale': force, 'motion_scale': motion}
+        return bridge.set_parameters_atomically([Parameter(n, value=v) for n, v in given.items()])
+
+    coupling = bridge._path.coupling
+    for alone in ({'force_scale': 3.0}, {'motion_scale': 3.0}):
+        coupling.check(**alone)
+    refused = ask(3.0, 3.0)
+    assert not refused.successful and 'the device bears' in refused.reason
+    assert coupling.check() == Order(1.0, bridge._path.haptics)
+    assert ask(0.25, 4.0).successful
+    with pytest.raises(SettingsError, match='the device bears'):
+        coupling.check(force_scale=3.0)
+    assert ask(3.0, 1.0).successful  # though the first of the two alone would be refused
+    assert (coupling.check().motion_scale, bridge._path.haptics.force_scale) == (1.0, 3.0)
+
+
+def test_a_scale_out_of_range_is_refused_in_a_sentence(bridge: HapticBridge):
+    for name, wrong, why in (
+        ('motion_scale', 0.0, 'motion_scale is 0: input should be greater than 0'),
+        ('motion_scale', 1e9, 'motion_scale is 1e+09: input should be less than or equal to 100'),
+        ('force_scale', -1.0, 'force_scale is -1: input should be greater than 0'),
+        ('force_scale', float('nan'), 'force_scale is nan: input should be a finite number'),
+    ):
+        refused = bridge.set_parameters([Parameter(name, value=wrong)])[0]
+        assert not refused.successful and refused.reason == why
 
 
 def test_the_mode_of_the_tool_is_a_parameter_and_a_button_changes_it(bridge: HapticBridge):

@@ -11,7 +11,11 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from cutting_trainer.haptic_bridge.devices.placement import find_touch, why_no_touch
+from cutting_trainer.haptic_bridge.devices.placement import (
+    PlacementError,
+    find_touch,
+    why_no_touch,
+)
 from cutting_trainer.haptic_bridge.devices.probe_force import (
     MAX_UNCERTAINTY_DEG,
     direction_uncertainty,
@@ -32,6 +36,8 @@ from cutting_trainer.node_common.ros import polled, take, take_raw
 
 FIRST_POSE_TIMEOUT_S = 5.0
 """[s] in which a publisher, and its first pose, must appear."""
+MAX_SILENCE_S = 1.0
+"""[s] without a pose after which a guided placement ends."""
 MAX_PUSH_TRAVEL_M = 0.03
 """[m] Motion of the tip at which a push is stopped."""
 _ANY_STREAM = QoSProfile(
@@ -182,14 +188,19 @@ class DeviceProbe(Node):
             name: of the point, for the message.
 
         Raises:
-            PlacementError: it did not move there, or was not still.
+            PlacementError: it did not move there, or was not still, or the driver fell silent.
         """
         self._drain()
         self._clear()
-        deadline = time.monotonic() + timeout
+        began, deadline = time.time(), time.monotonic() + timeout
         while time.monotonic() < deadline:
             time.sleep(0.05)
             self._drain()
+            if time.time() - max([began, *self._arrivals[-1:]]) > MAX_SILENCE_S:
+                raise PlacementError(
+                    f'{self.pose_topic} fell silent before {name} was touched: see whether its '
+                    'driver runs, and begin again'
+                )
             if self._arrivals:
                 poses = self._all()
                 if (found := find_touch(poses.arrivals, poses.positions, metres)) is not None:

@@ -114,7 +114,8 @@ def _jitter(poses: Poses, topic: str) -> ProbeCheck:
         'wrong',
         measured,
         f'{topic} was silent for {1e3 * gaps.max():.0f} ms, and the bridge enters FAULT after '
-        f'{1e3 * MAX_GAP_S:g}: give the driver a real-time priority or a quieter machine',
+        f'{1e3 * MAX_GAP_S:g}: give the driver real-time priority (chrt -f 20), or a quieter '
+        'machine',
     )
 
 
@@ -131,8 +132,8 @@ def _age(poses: Poses, topic: str) -> ProbeCheck:
         'age',
         'wrong',
         f'{age:.3g} s',
-        f'the poses of {topic} {late} by {abs(age):.3g} s: set both clocks alike (chrony, ptp4l), '
-        'or find the queue that they wait in',
+        f'the poses of {topic} {late} by {abs(age):.3g} s: on two machines set both clocks alike '
+        '(chrony, ptp4l); on one, find the queue that they wait in, or end what keeps it busy',
     )
 
 
