@@ -3,11 +3,14 @@
 import json
 import math
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from rich.console import Console
 
 from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.bags.writer import BagWriter
@@ -20,6 +23,7 @@ from cutting_trainer.exercises.attempt_store import (
 )
 from cutting_trainer.node_common.share_folder import PACKAGES
 from cutting_trainer.recordings.attempts_command import (
+    comparison_table,
     delete,
     export_rows,
     find,
@@ -103,6 +107,41 @@ def test_a_file_that_is_no_index_is_named(tmp_path) -> None:
     (tmp_path / STORE_FILE).write_bytes(b'no index at all' * 100)
     with pytest.raises(SessionError, match='is no index'):
         open_store(tmp_path)
+
+
+def test_a_damaged_index_and_one_with_other_columns_are_named(tmp_path) -> None:
+    file = tmp_path / STORE_FILE
+    with closing(sqlite3.connect(file)) as other, other:
+        other.execute('CREATE TABLE attempts (subject TEXT, exercise TEXT, begun REAL)')
+    with pytest.raises(SessionError, match='is no index'):
+        open_store(tmp_path)
+    file.unlink()
+    open_store(tmp_path).put(row(f'/x/{number}', number=number) for number in range(100))
+    content = bytearray(file.read_bytes())
+    content[8192:] = b'\xaa' * (len(content) - 8192)
+    file.write_bytes(content)
+    with pytest.raises(SessionError, match='is no index'):
+        open_store(tmp_path)
+
+
+def test_nobody_is_told_to_delete_an_index_that_is_in_use_or_a_folder(tmp_path) -> None:
+    file = tmp_path / STORE_FILE
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute('BEGIN EXCLUSIVE')
+        with pytest.raises(SessionError, match='in use by another program'):
+            open_store(tmp_path)
+    file.unlink(missing_ok=True)
+    file.mkdir()
+    with pytest.raises(SessionError, match='cannot be opened'):
+        open_store(tmp_path)
+
+
+def test_a_comparison_names_the_exercises_and_shows_no_nan() -> None:
+    console = Console(width=100)
+    with console.capture() as captured:
+        console.print(comparison_table(row('/x/1'), row('/x/2', points=math.nan, exercise='pad')))
+    text = captured.get()
+    assert 'circle' in text and 'pad' in text and 'nan' not in text
 
 
 def test_attempts_count_on_over_index_and_bags_that_are_not_in_it_yet(tmp_path) -> None:
