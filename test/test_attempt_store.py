@@ -5,6 +5,7 @@ import math
 import shutil
 import sqlite3
 from contextlib import closing
+from html import escape
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -186,6 +187,18 @@ def exercised(folder: Path, number: int) -> Path:
     data.update(subject='SUBJECT', attempt=str(number))
     file.write_text(yaml.safe_dump(content), encoding='utf-8')
     return folder
+
+
+def test_the_report_has_the_points_of_the_list_and_their_reasons(tmp_path) -> None:
+    bag = exercised(tmp_path / 'one', 1)
+    index_bags(store := open_store(tmp_path), tmp_path)
+    (attempt,) = store.rows()
+    with pytest.raises(SystemExit) as ended:
+        main(['report', str(bag), '-o', str(tmp_path / 'report.html')])
+    assert not ended.value.code
+    page = (tmp_path / 'report.html').read_text(encoding='utf-8')
+    assert f'with {attempt.points:.1f} points' in page
+    assert attempt.reasons and all(escape(reason) in page for reason in attempt.reasons)
 
 
 def test_the_command_lists_compares_exports_and_deletes(tmp_path, capsys) -> None:
