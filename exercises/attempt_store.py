@@ -6,7 +6,7 @@ import secrets
 import sqlite3
 from collections.abc import Iterable, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ class AttemptStore:
         file: made where there is none; its folder too.
 
     Raises:
-        sqlite3.DatabaseError: the file is no index.
+        sqlite3.DatabaseError: the file is no index, is damaged, or cannot be opened.
     """
 
     def __init__(self, file: Path) -> None:
@@ -72,6 +72,12 @@ class AttemptStore:
         self._file = file
         with closing(self._connect()) as connection:
             connection.executescript(_SCHEMA)
+            columns = [each['name'] for each in connection.execute('PRAGMA table_info(attempts)')]
+            if columns != [each.name for each in fields(AttemptRow)]:
+                raise sqlite3.DatabaseError('its table has other columns')
+            (found,) = connection.execute('PRAGMA quick_check(1)').fetchone()
+            if found != 'ok':
+                raise sqlite3.DatabaseError(found)
 
     def _connect(self) -> sqlite3.Connection:
         connection = sqlite3.connect(self._file)

@@ -104,19 +104,23 @@ def list_table(rows: Sequence[AttemptRow]) -> Table:
     for row in rows:
         begun = datetime.fromtimestamp(row.begun, UTC)
         result = ('passed' if row.passed else 'failed') if row.state == 'scored' else row.state
-        points = '' if math.isnan(row.points) else f'{row.points:.1f}'
         name = Path(row.bag).name
         table.add_row(
             f'{begun:%Y-%m-%d %H:%M:%S}', escape(row.subject), escape(row.exercise),
-            str(row.attempt), points, result, escape(name),
+            str(row.attempt), _points(row), result, escape(name),
         )  # fmt: skip
     return table
+
+
+def _points(row: AttemptRow) -> str:
+    return '' if math.isnan(row.points) else f'{row.points:.1f}'
 
 
 def comparison_table(one: AttemptRow, two: AttemptRow) -> Table:
     """Return two attempts side by side, a row for each measure that one of them has."""
     table = Table('measure', escape(Path(one.bag).name), escape(Path(two.bag).name))
-    table.add_row('points', f'{one.points:.1f}', f'{two.points:.1f}')
+    table.add_row('exercise', escape(one.exercise), escape(two.exercise))
+    table.add_row('points', _points(one), _points(two))
     for name in MEASURES:
         values = [row.measures.get(name, math.nan) for row in (one, two)]
         if not all(map(math.isnan, values)):

@@ -173,7 +173,7 @@ def _exercise(bag: Bag, scene: Scene | None) -> list[str]:
         for each in got.deductions
     ]
     return [
-        f'<h2>{escape(scene.exercise.title)}: {verdict} with {got.points:.0f} points</h2>',
+        f'<h2>{escape(scene.exercise.title)}: {verdict} with {got.points:.1f} points</h2>',
         table(rows, ('measure', 'value', 'points')),
         ''.join(f'<p class="note">{escape(reason)}</p>' for reason in got.reasons),
     ]

@@ -10,18 +10,30 @@ from cutting_trainer.exercises.attempt_store import AttemptStore, new_pseudonym
 from cutting_trainer.session.errors import SessionError
 
 STORE_FILE = 'attempts.sqlite'
+_NO_INDEX = (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_ERROR)
+"""Errors of a file with other content; those of disk and permissions are not among them."""
 
 
 def open_store(folder: Path) -> AttemptStore:
     """Return the index of a folder of bags.
 
     Raises:
-        SessionError: its file is no index.
+        SessionError: its file is no index, is in use, or cannot be opened.
     """
     file = folder.resolve() / STORE_FILE
     try:
         return AttemptStore(file)
-    except sqlite3.DatabaseError:
+    except sqlite3.DatabaseError as error:
+        code = getattr(error, 'sqlite_errorcode', sqlite3.SQLITE_NOTADB)
+        if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+            raise SessionError(
+                f'{file} is in use by another program: start again when that is done'
+            ) from None
+        if file.is_dir() or code not in _NO_INDEX:
+            raise SessionError(
+                f'{file} cannot be opened or written ({error}): check that it is a file, its '
+                'permissions and the disk'
+            ) from None
         raise SessionError(
             f'{file} is no index of attempts: delete it, and it is made anew from the bags'
         ) from None

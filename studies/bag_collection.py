@@ -56,7 +56,9 @@ def _bags_by(pattern: str, folder: Path) -> list[Path]:
         matches = [whole]
     bags = [bag for match in matches if match.is_dir() for bag in _bags_below(match)]
     if not bags:
-        if matches:
+        if all(match.suffix == '.mcap' for match in matches) and matches:
+            reason = 'a bag is the folder of its .mcap file: name that'
+        elif matches:
             reason = 'there is no bag in it, no folder with metadata.yaml or an .mcap file'
         elif glob.has_magic(pattern):
             reason = 'no file matches it'

@@ -108,7 +108,7 @@ def others_cluster(address: str) -> Iterator[Client]:
     except (OSError, ValueError, RuntimeError) as error:
         raise SessionError(
             f'--scheduler {address}: no Dask scheduler answers there '
-            f'({" ".join(str(error).split())[:150]}): start one with `dask scheduler`'
+            f'({" ".join(str(error).split())[:150]}): start one with `./trainer run dask scheduler`'
         ) from None
     with client:
         try:

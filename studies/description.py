@@ -123,7 +123,7 @@ class Designs(SceneModel):
 
     @model_validator(mode='after')
     def _some(self) -> Self:
-        if not self.model_fields_set:
+        if not (self.grid or self.cases or self.latin_hypercube or self.sobol):
             raise ValueError(f'there is no design: give {", ".join(type(self).model_fields)}')
         size = 1
         for values in self.grid.values():

@@ -111,7 +111,7 @@ def as_text(summary: StudySummary) -> Group:
     effects = summary.settings if few or not summary.keys else summary.keys
     shown = Table(box=box.SIMPLE_HEAD)
     for number, name in enumerate(_HEAD[1:]):
-        shown.add_column(name, justify='right' if number else 'left')
+        shown.add_column(name, justify='right' if number else 'left', overflow='fold')
     output = ''
     for effect in effects[:MAX_LINES]:
         name, *cells = map(escape_markup, _cells(effect))

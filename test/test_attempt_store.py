@@ -3,11 +3,15 @@
 import json
 import math
 import shutil
+import sqlite3
+from contextlib import closing
+from html import escape
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from rich.console import Console
 
 from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.bags.writer import BagWriter
@@ -20,6 +24,7 @@ from cutting_trainer.exercises.attempt_store import (
 )
 from cutting_trainer.node_common.share_folder import PACKAGES
 from cutting_trainer.recordings.attempts_command import (
+    comparison_table,
     delete,
     export_rows,
     find,
@@ -105,6 +110,41 @@ def test_a_file_that_is_no_index_is_named(tmp_path) -> None:
         open_store(tmp_path)
 
 
+def test_a_damaged_index_and_one_with_other_columns_are_named(tmp_path) -> None:
+    file = tmp_path / STORE_FILE
+    with closing(sqlite3.connect(file)) as other, other:
+        other.execute('CREATE TABLE attempts (subject TEXT, exercise TEXT, begun REAL)')
+    with pytest.raises(SessionError, match='is no index'):
+        open_store(tmp_path)
+    file.unlink()
+    open_store(tmp_path).put(row(f'/x/{number}', number=number) for number in range(100))
+    content = bytearray(file.read_bytes())
+    content[8192:] = b'\xaa' * (len(content) - 8192)
+    file.write_bytes(content)
+    with pytest.raises(SessionError, match='is no index'):
+        open_store(tmp_path)
+
+
+def test_nobody_is_told_to_delete_an_index_that_is_in_use_or_a_folder(tmp_path) -> None:
+    file = tmp_path / STORE_FILE
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute('BEGIN EXCLUSIVE')
+        with pytest.raises(SessionError, match='in use by another program'):
+            open_store(tmp_path)
+    file.unlink(missing_ok=True)
+    file.mkdir()
+    with pytest.raises(SessionError, match='cannot be opened'):
+        open_store(tmp_path)
+
+
+def test_a_comparison_names_the_exercises_and_shows_no_nan() -> None:
+    console = Console(width=100)
+    with console.capture() as captured:
+        console.print(comparison_table(row('/x/1'), row('/x/2', points=math.nan, exercise='pad')))
+    text = captured.get()
+    assert 'circle' in text and 'pad' in text and 'nan' not in text
+
+
 def test_attempts_count_on_over_index_and_bags_that_are_not_in_it_yet(tmp_path) -> None:
     assert attempt_data(tmp_path, 'circle', '', 'n')['attempt'] == '1'
     store = open_store(tmp_path)
@@ -147,6 +187,18 @@ def exercised(folder: Path, number: int) -> Path:
     data.update(subject='SUBJECT', attempt=str(number))
     file.write_text(yaml.safe_dump(content), encoding='utf-8')
     return folder
+
+
+def test_the_report_has_the_points_of_the_list_and_their_reasons(tmp_path) -> None:
+    bag = exercised(tmp_path / 'one', 1)
+    index_bags(store := open_store(tmp_path), tmp_path)
+    (attempt,) = store.rows()
+    with pytest.raises(SystemExit) as ended:
+        main(['report', str(bag), '-o', str(tmp_path / 'report.html')])
+    assert not ended.value.code
+    page = (tmp_path / 'report.html').read_text(encoding='utf-8')
+    assert f'with {attempt.points:.1f} points' in page
+    assert attempt.reasons and all(escape(reason) in page for reason in attempt.reasons)
 
 
 def test_the_command_lists_compares_exports_and_deletes(tmp_path, capsys) -> None:

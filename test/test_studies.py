@@ -80,9 +80,17 @@ def test_bad_study_file_gives_one_sentence_with_its_place(
     assert all(words in sentence for words in said), sentence
 
 
-def test_study_file_without_a_design_names_the_designs(tmp_path: Path) -> None:
+@pytest.mark.parametrize('designs', ['{}', '{grid: {}}', '{cases: []}'])
+def test_study_file_without_a_design_names_the_designs(tmp_path: Path, designs: str) -> None:
     with pytest.raises(SceneError, match='there is no design: give grid, cases'):
-        study(tmp_path, 'bags: [bags]\nsettings: {}\n')
+        study(tmp_path, f'bags: [bags]\nsettings: {designs}\n')
+
+
+def test_an_mcap_file_in_place_of_its_bag_is_named(tmp_path: Path) -> None:
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'bag_0.mcap').touch()
+    with pytest.raises(SessionError, match=r'a bag is the folder of its \.mcap file'):
+        find_bags(['bag/bag_0.mcap'], tmp_path)
 
 
 def test_settings_are_those_of_all_designs_each_once(tmp_path: Path) -> None:
