@@ -242,9 +242,12 @@ def test_worker_that_dask_gives_up_is_started_anew() -> None:
     # It does so where a worker is killed again before it is back: such a study had no end.
     with own_cluster(1) as client:
         (before,) = client.nthreads()
+        until = time.monotonic() + _TIMEOUT_S
+        while not client.cluster.workers:  # it is there before its cluster knows of it
+            assert time.monotonic() < until, 'the cluster has no worker'
+            time.sleep(0.01)
         (nanny,) = client.cluster.workers.values()
         client.sync(nanny.close)
-        until = time.monotonic() + _TIMEOUT_S
         while not client.nthreads() or before in client.nthreads():
             assert time.monotonic() < until, 'there is no worker any more'
             time.sleep(0.1)
