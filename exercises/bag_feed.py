@@ -11,6 +11,11 @@ from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec, WrenchStampedCodec
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
+MOTION_FIELDS = [
+    ContactCodec.fields[name] for name in ('device', 'blade_root', 'blade_tip', 'state')
+]
+"""Places in a contact of what `Attempt.add_motion` takes after the time."""
+
 
 def read_attempt(bag: Bag, exercise: ExerciseSettings) -> Attempt:
     """Return the attempt that a bag records.
@@ -28,7 +33,6 @@ def read_attempt(bag: Bag, exercise: ExerciseSettings) -> Attempt:
     attempt = Attempt(exercise)
     servo_cf = of_session(SERVO_CF, bag.topics())
     contacts, wrenches = ContactCodec(), WrenchStampedCodec()
-    places = [ContactCodec.fields[name] for name in ('device', 'blade_root', 'blade_tip', 'state')]
     force = WrenchStampedCodec.fields['force']
     motion: list[list[float]] = []
     forces: list[tuple[float, ...]] = []
@@ -40,7 +44,7 @@ def read_attempt(bag: Bag, exercise: ExerciseSettings) -> Attempt:
         if message.topic == CONTACT:
             stamp, _, values = contacts.decode(message.data)
             if stamp:  # 0: there was no device yet
-                row = (x for place in places for x in values[place])
+                row = (x for place in MOTION_FIELDS for x in values[place])
                 motion.append([(stamp - origin) * 1e-9, *row])
         elif message.topic == servo_cf:
             stamp, _, values = wrenches.decode(message.data)

@@ -30,13 +30,12 @@ from cutting_trainer.exercises.opened_tissue import (
     zones_touched,
 )
 from cutting_trainer.exercises.scene_schema import MEASURES, ExerciseSettings, MeasureName
+from cutting_trainer.tissue_sim.contact.tool import ContactState
 
 Floats = NDArray[np.float64]
 NAN = float('nan')
 _BEGUN = 0.1
 """Opened share of a target from which it counts as begun."""
-_INSIDE = 2
-"""`Contact.INSIDE`."""
 
 
 class Attempt:
@@ -49,8 +48,8 @@ class Attempt:
     def __init__(self, exercise: ExerciseSettings) -> None:
         self.exercise = exercise
         self._curves = [Curve(target) for target in exercise.targets]
-        self._motion: list[Floats] = []
-        self._forces: list[Floats] = []
+        self._motion = [np.zeros((0, 11))]
+        self._forces = [np.zeros((0, 2))]
         self._begun: dict[int, float] = {}
         self._coverage: list[Coverage] = []
         self._opened = Opened(np.zeros((0, 3)), np.zeros(0))
@@ -120,7 +119,7 @@ class Attempt:
 
     def _is_back(self) -> bool | None:
         """Return whether the tip is back at the end; None: no end, or nothing was touched."""
-        motion = np.concatenate([np.zeros((0, 11)), *self._motion])
+        motion = _joined(self._motion)
         touched = np.flatnonzero(motion[:, 10] > 0)
         if self.exercise.end is None or not len(touched):
             return None
@@ -132,8 +131,7 @@ class Attempt:
 
     def _during(self) -> tuple[Floats, Floats]:
         """Return motion and forces from the start of the clock to its end."""
-        motion = np.concatenate([np.zeros((0, 11)), *self._motion])
-        forces = np.concatenate([np.zeros((0, 2)), *self._forces])
+        motion, forces = _joined(self._motion), _joined(self._forces)
         if not len(motion):
             return motion, forces
         exercise = self.exercise
@@ -169,7 +167,7 @@ class Attempt:
         slow = smoothed(path)
         length = float(np.linalg.norm(np.diff(slow, axis=0), axis=1).sum())
         time = float(motion[-1, 0] - motion[0, 0])
-        inside = motion[:, 10] == _INSIDE
+        inside = motion[:, 10] == ContactState.INSIDE
         blade = motion[inside, 4:7] - motion[inside, 7:10]
         norm = np.maximum(np.linalg.norm(blade, axis=1), 1e-12)
         tilt = np.degrees(np.arccos(np.clip(blade[:, 2] / norm, -1, 1)))
@@ -257,3 +255,10 @@ class Attempt:
         times = motion[0, 0] + np.arange(len(path)) / RATE_HZ
         pressed = np.interp(times, forces[:, 0], forces[:, 1]) >= mark.force
         return holds(times, path, pressed, mark.seconds, mark.radius)
+
+
+def _joined(batches: list[Floats]) -> Floats:
+    """Return all samples in one array, which takes the place of the batches."""
+    if len(batches) > 1:
+        batches[:] = [np.concatenate(batches)]
+    return batches[0]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cutting_trainer.exercises.scene_schema import BallSettings, TargetSettings, ZoneSettings
+from cutting_trainer.tissue_sim.mesh import pieces
 from cutting_trainer.tissue_sim.mesh.pieces import free_parts
 
 Floats = NDArray[np.float64]
@@ -23,16 +24,8 @@ _MAX_ORDER = 40
 _NOWHERE = 1e9
 
 
-class Tissue(Protocol):
-    """Mesh of a simulation or its replica."""
-
-    @property
-    def rest(self) -> Floats:
-        """Positions at rest [m], shape (n, 3)."""
-
-    @property
-    def tetrahedra(self) -> NDArray[Any]:
-        """Corners, shape (m, 4)."""
+class Tissue(pieces.Tissue, Protocol):
+    """Mesh of a simulation or its replica, with its surface."""
 
     @property
     def triangles(self) -> NDArray[Any]:
@@ -41,10 +34,6 @@ class Tissue(Protocol):
     @property
     def triangle_kind(self) -> NDArray[Any]:
         """1 for a cut face, 0 outside, shape (k,)."""
-
-    @property
-    def fixed(self) -> NDArray[np.uint8]:
-        """1 where a node does not move, shape (n,)."""
 
 
 @dataclass(frozen=True)

@@ -66,10 +66,10 @@ class HandCoupling:
     ) -> None:
         check_together(tool, device, haptics, profile)
         self._tool, self._device, self._profile, self._steps = tool, device, profile, steps
-        self.setup = force_kernels.make_setup(tool, device, haptics, profile, steps)
         self.indexing = Indexing.of(device.tissue_from_device)
         self.unsent: deque[Indexing] = deque(maxlen=_MAX_UNSENT)
         self._order = self._done = Order(self.indexing.scale, haptics)
+        self._renew()
 
     @property
     def haptics(self) -> HapticsSettings:

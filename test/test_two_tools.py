@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from meshes import box
 
-from bench.figures.arms_energy import accounts
+from bench.figures.arms_energy import STIFFNESS, TOP, accounts, contact_of
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.session.in_process import Tissue
@@ -28,7 +28,6 @@ from cutting_trainer.tissue_sim.simulation.state import from_state, state_of
 
 pytestmark = pytest.mark.long
 
-TOP, STIFFNESS, RADIUS = 0.02, 400.0, 0.001
 UP, ALONG = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 
 
@@ -57,20 +56,7 @@ def at_node(simulation: TissueSimulation, x: float, y: float, z: float) -> ToolC
     mesh = simulation.mesh
     node = int(np.linalg.norm(mesh.rest - [x, y, TOP], axis=1).argmin())
     tip = np.array([*mesh.rest[node, :2], z])
-    return ToolContact(
-        state=ContactState.TOUCHING if z < TOP else ContactState.NONE,
-        topology=mesh.topology,
-        nodes=np.array([node]),
-        weights=np.ones(1),
-        device=tip + RADIUS * UP,
-        offset=RADIUS * UP,
-        normal=UP,
-        stiffness=STIFFNESS,
-        radius=RADIUS,
-        blade_root=tip + 0.03 * UP,
-        blade_tip=tip,
-        mode=ToolMode.PALPATOR,
-    )
+    return replace(contact_of(mesh, tip), mode=ToolMode.PALPATOR)
 
 
 def grasper(contact: ToolContact, *, closed: bool) -> ToolContact:

@@ -94,7 +94,7 @@ class _TwoTools:
         self._asked: tuple[Frame, np.ndarray] | None = None
         self._before: list[tuple[np.ndarray, np.ndarray]] = []
         self._work, self._lost, self._paid, self._entered = np.zeros(2), 0.0, 0.0, 0.0
-        self._held = self._at(np.array([*GRASPED, TOP]))
+        self._held = contact_of(self.simulation.mesh, np.array([*GRASPED, TOP]))
         self._frame: Frame | None = None
 
     def frame(self, blade: np.ndarray, height: float, *, closed: bool) -> None:
@@ -110,7 +110,7 @@ class _TwoTools:
             mode=mode,
             device=tip + RADIUS * _UP,
         )
-        frame = self.simulation.frame(self._at(blade), jaws)
+        frame = self.simulation.frame(contact_of(self.simulation.mesh, blade), jaws)
         self._frame = frame
         if frame.command is not None:
             self._asked = frame, self.simulation.positions
@@ -155,23 +155,23 @@ class _TwoTools:
         work = float(self._work[0]), float(self._work[1])
         return Account(work, stored, self._lost, self._paid)
 
-    def _at(self, tip: np.ndarray) -> ToolContact:
-        """Return the contact of a tip over a node of the top at rest."""
-        mesh = self.simulation.mesh
-        node = int(np.linalg.norm(mesh.rest - [*tip[:2], TOP], axis=1).argmin())
-        return ToolContact(
-            state=ContactState.TOUCHING if tip[2] < TOP else ContactState.NONE,
-            topology=mesh.topology,
-            nodes=np.array([node]),
-            weights=np.ones(1),
-            device=tip + RADIUS * _UP,
-            offset=RADIUS * _UP,
-            normal=_UP,
-            stiffness=STIFFNESS,
-            radius=RADIUS,
-            blade_root=tip + 0.03 * _UP,
-            blade_tip=tip,
-        )
+
+def contact_of(mesh: TetMesh, tip: np.ndarray) -> ToolContact:
+    """Return the contact of a tip [m], shape (3,), over the nearest node of the flat top."""
+    node = int(np.linalg.norm(mesh.rest - [*tip[:2], TOP], axis=1).argmin())
+    return ToolContact(
+        state=ContactState.TOUCHING if tip[2] < TOP else ContactState.NONE,
+        topology=mesh.topology,
+        nodes=np.array([node]),
+        weights=np.ones(1),
+        device=tip + RADIUS * _UP,
+        offset=RADIUS * _UP,
+        normal=_UP,
+        stiffness=STIFFNESS,
+        radius=RADIUS,
+        blade_root=tip + 0.03 * _UP,
+        blade_tip=tip,
+    )
 
 
 def accounts(rate: float = RATE_HZ) -> Accounts:

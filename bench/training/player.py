@@ -6,16 +6,15 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from cutting_trainer.exercises.bag_feed import MOTION_FIELDS
 from cutting_trainer.exercises.metrics import Attempt
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
 from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import HandSettings, ScriptSettings
-from cutting_trainer.node_common.cdr_codec import ContactCodec
 from cutting_trainer.session.in_process import TICK_S, simulate
 from cutting_trainer.session.scene_loader import Scene, load_scene
 
 Floats = NDArray[np.float64]
-_PLACES = [ContactCodec.fields[name] for name in ('device', 'blade_root', 'blade_tip', 'state')]
 _TICK_NS = 1_000_000
 
 
@@ -72,7 +71,7 @@ def play(scene: str, person: Person) -> Attempt:
         arm.command((k + 1) * _TICK_NS, out.wrench[:3], k * _TICK_NS)
         time = k * TICK_S
         motion[k, 0] = forces[k, 0] = time
-        motion[k, 1:] = [x for place in _PLACES for x in out.contact[place]]
+        motion[k, 1:] = [x for place in MOTION_FIELDS for x in out.contact[place]]
         forces[k, 1] = np.linalg.norm(out.wrench[:3])
         if mesh.topology != topology:
             topology = mesh.topology
