@@ -86,6 +86,10 @@ def view(
         bool, typer.Option('--resimulate', help='Compute the bag again, and show that beside it.')
     ] = False,
     changes: Changes = None,
+    beside: Annotated[
+        Path | None,
+        typer.Option(help='Folder of another bag, to show beside --bag at the same time.'),
+    ] = None,
     seed: Seed = 0,
     domain: Domain = '',
 ) -> None:
@@ -97,14 +101,18 @@ def view(
         from cutting_trainer.recordings.view_bag_command import ReplayOptions, view_bag
         from cutting_trainer.session.scene_overrides import parse_changes
 
+        if beside is not None and (resimulate or changes):
+            raise SessionError('--beside shows another bag: leave out --resimulate and --with')
         replayed = ReplayOptions(
-            bag, resimulate, parse_changes(changes or []), host, port, allow_host or ()
+            bag, resimulate, parse_changes(changes or []), host, port, allow_host or (), beside
         )
         with reading(bag):
             status = view_bag(replayed)
         raise typer.Exit(int(status))
-    if resimulate or changes:
-        raise SessionError('--resimulate and --with are for a recorded session: give its --bag')
+    if resimulate or changes or beside is not None:
+        raise SessionError(
+            '--resimulate, --with and --beside are for a recorded session: give its --bag'
+        )
     if records and attach:
         raise SessionError('--record is for a session of its own: ./trainer record records others')
     options = ViewOptions(

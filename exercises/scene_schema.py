@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from cutting_trainer.node_common.scene_reader import SceneModel
+from cutting_trainer.node_common.scene_reader import SceneModel, read_section
+from cutting_trainer.node_common.share_folder import scene_names, share_folder
 
 Coordinate = Annotated[float, Field(ge=-2, le=2)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -181,3 +182,13 @@ class ExerciseSettings(SceneModel):
             if name in names and not given:
                 raise ValueError(f'the measure {name} needs {words}: add them or delete it')
         return self
+
+
+def exercise_titles() -> dict[str, str]:
+    """Return the titles of the exercises that come with the trainer, by scene."""
+    titles = {}
+    for name in scene_names():
+        scene = share_folder() / 'config' / 'scenes' / f'{name}.yaml'
+        if title := read_section(scene, 'exercise', ExerciseSettings).title:
+            titles[name] = title
+    return titles

@@ -1,5 +1,6 @@
 """`trainer view --bag`: show a recorded session in the browser, beside its recomputation."""
 
+import os
 import signal
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,8 +29,9 @@ from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.in_process import make_force_path
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.contact.tool import Frame
-from cutting_trainer.viewer.access_control import link, make_gate
+from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, link, make_gate
 from cutting_trainer.viewer.bag_timeline import ComputedTissue
+from cutting_trainer.viewer.recording import Recording, computed_beside, recorded_beside
 from cutting_trainer.viewer.replay_page import ReplayPage
 
 
@@ -41,6 +43,7 @@ class ReplayOptions:
         bag: folder of the bag.
         resimulate: recompute the session, and show both.
         changes: changes of the scene for the recomputation, by dotted key.
+        beside: folder of another bag to show beside it; None: none.
         host, port: address and port of the page.
         allow_host: host names under which the page is served.
     """
@@ -51,6 +54,7 @@ class ReplayOptions:
     host: str
     port: int
     allow_host: Sequence[str] = ()
+    beside: Path | None = None
 
 
 def view_bag(options: ReplayOptions) -> Status:
@@ -59,25 +63,36 @@ def view_bag(options: ReplayOptions) -> Status:
     Raises:
         BagError, SessionError, SceneError, PageError: an option or the bag is not valid.
     """
-    bag = open_bag(options.bag)
-    notes = Console(stderr=True)
-    computed, name = None, ''
+    notes, beside = Console(stderr=True), None
     host, port, names = options.host, options.port, options.allow_host
-    gate = make_gate(host, names)
+    gate = make_gate(host, names, os.environ.get(TOKEN_VARIABLE, ''))
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
-        scene = load_scene(str(restore_scene(bag, Path(temporary), options.changes)))
+        bag = open_bag(options.bag)
+        recording, scene = _recording(bag, Path(temporary), options.changes)
         if options.resimulate or options.changes:
             name = ', '.join(f'{k}={v}' for k, v in options.changes.items()) or 'computed again'
             computed = resimulated(bag, scene, notes, changed=bool(options.changes))
-        page = ReplayPage(
-            bag, scene.tool, scene.device, scene.exercise, computed, name, host, port, gate
-        )
+            beside = computed_beside(name, computed)
+        elif options.beside is not None:
+            folder = Path(temporary) / 'beside'
+            folder.mkdir()
+            other, _ = _recording(open_bag(options.beside), folder)
+            beside = recorded_beside(other, recording)
+        page = ReplayPage(recording, beside, host, port, gate)
     with _interrupts() as seen:
         shown = link(host, page.server.port, names, gate.token)
         notes.print(f'page: {shown} (Ctrl-C ends it)', highlight=False, soft_wrap=True)
         page.run(lambda: bool(seen))
     page.server.stop()
     return Status.OK
+
+
+def _recording(
+    bag: Bag, folder: Path, changes: Mapping[str, str] | None = None
+) -> tuple[Recording, Scene]:
+    """Return a recorded session, and its scene with changes, whose file goes into a folder."""
+    scene = load_scene(str(restore_scene(bag, folder, changes or {})))
+    return Recording(bag, scene.tool, scene.device, scene.exercise), scene
 
 
 def resimulated(bag: Bag, scene: Scene, notes: Console, *, changed: bool) -> ComputedTissue:

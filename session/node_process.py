@@ -21,7 +21,7 @@ MAX_READS = 16
 HEARTBEAT_PERIOD_S = 0.5
 LOG_CLOSE_TIMEOUT_S = 2.0
 """Time [s] that the end of a node waits for the disk to write the last lines of its log."""
-_BOUND = (sys.executable, '-I', '-S', str(Path(__file__).with_name('parent_death_signal.py')))
+BOUND = (sys.executable, '-I', '-S', str(Path(__file__).with_name('parent_death_signal.py')))
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class NodeProcess:
         beating = {HEARTBEAT: f'{HEARTBEAT_PERIOD_S:g}'} if command.has_heartbeat else {}
         orphaned = signal.SIGTERM if command.records else signal.SIGKILL
         self.process = subprocess.Popen(
-            [*_BOUND, str(os.getpid()), str(int(orphaned)), *command.argv],
+            [*BOUND, str(os.getpid()), str(int(orphaned)), *command.argv],
             stdin=subprocess.PIPE
             if command.converses or command.e_stop_arguments
             else subprocess.DEVNULL,

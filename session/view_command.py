@@ -4,15 +4,19 @@ import json
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console
 
+from cutting_trainer.exercises.attempt_store import new_pseudonym
 from cutting_trainer.haptic_bridge.devices.convention import METRES
 from cutting_trainer.node_common.errors import MeshError, SceneError
 from cutting_trainer.node_common.share_folder import scene_names
+from cutting_trainer.session.attempts import attempt_data
+from cutting_trainer.session.beside_page import Address, AttemptList, ReplayServer
 from cutting_trainer.session.demo_command import new_bag, report_failed_start
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.errors import SessionError
@@ -95,8 +99,10 @@ def run_view(options: ViewOptions) -> Status:
     with (
         reserved_domain(options.domain) as domain,
         tempfile.TemporaryDirectory(prefix='trainer-') as temporary,
+        ExitStack() as stack,
     ):
         session = _Session(scene, options, Path(temporary), notes)
+        stack.callback(session.close)
         nodes = [viewer, *session.nodes(), *session.recorder()]
         with (
             SessionProgress(notes, len(nodes)) as progress,
@@ -177,6 +183,9 @@ class _Session:
         self._file = scene.path
         self._method: str = scene.cutting.method
         self._recording: Path | None = None
+        self._subject, self._is_attempt = '', False
+        self._attempts = AttemptList()
+        self._replays = ReplayServer(Address(options.host, options.port, options.allow_host))
         self._is_new = True  # the viewer does not have the scene file of the nodes yet
         self._asked: list[dict[str, Any]] = []
 
@@ -192,7 +201,20 @@ class _Session:
         if not self._options.record:
             return []
         self._recording = new_bag(None, self._scene.name)
-        return [recorder_command(self._file, self._recording, self._options.seed)]
+        return [self._recorder_command(self._recording)]
+
+    def _recorder_command(self, bag: Path) -> NodeCommand:
+        """Return the command of the recorder; the bag of an exercise says whose attempt it is."""
+        said = {}
+        if self._scene.exercise.title:
+            self._subject = self._subject or new_pseudonym()
+            said = attempt_data(bag.parent, self._scene.name, self._subject, '')
+        return recorder_command(self._file, bag, self._options.seed, said)
+
+    def close(self) -> None:
+        """End the programs beside the session."""
+        self._attempts.end()
+        self._replays.end()
 
     def event_handler(self, progress: SessionProgress) -> Callable[[Event], None]:
         """Return a handler of the supervisor's events."""
@@ -212,15 +234,29 @@ class _Session:
         """Serve the requests since the last call."""
         while self._asked:
             request = self._asked.pop(0)
-            try:
-                self._do(request, supervisor)
-                problem = ''
-            except (SessionError, SceneError, MeshError, ValueError) as error:
-                problem = 'This could not be done: the terminal says why.'
-                self._notes.print(f'asked by the page: {error}', style='red', markup=False)
-            except (KeyError, TypeError):  # no page of ours asks so
-                problem = 'The request of the page could not be understood: nothing was done.'
-            self._answer(supervisor, problem=problem)
+            self._answer(supervisor, problem=self._try(lambda: self._do(request, supervisor)))  # noqa: B023
+        for tell in (self._tell_attempts, self._tell_replay):
+            if problem := self._try(lambda: tell(supervisor)):  # noqa: B023
+                self._answer(supervisor, problem=problem)
+
+    def _try(self, job: Callable[[], None]) -> str:
+        """Do something; return why it failed, for the page; '' where it did not."""
+        try:
+            job()
+        except (SessionError, SceneError, MeshError, ValueError) as error:
+            self._notes.print(f'asked by the page: {error}', style='red', markup=False)
+            return 'This could not be done: the terminal says why.'
+        except (KeyError, TypeError):  # no page of ours asks so
+            return 'The request of the page could not be understood: nothing was done.'
+        return ''
+
+    def _tell_attempts(self, supervisor: Supervisor) -> None:
+        if (rows := self._attempts.news()) is not None:
+            self._answer(supervisor, attempts=rows)
+
+    def _tell_replay(self, supervisor: Supervisor) -> None:
+        if (served := self._replays.news()) is not None:
+            self._answer(supervisor, replay=served)
 
     def _do(self, request: dict[str, Any], supervisor: Supervisor) -> None:
         if request['ask'] == 'restart':
@@ -230,10 +266,26 @@ class _Session:
             if (method := request.get('method', self._method)) not in METHODS:
                 raise SessionError('the requested method of cutting does not exist')
             self._restart(name, method, supervisor)
+        elif request['ask'] == 'attempt':
+            self._begin_attempt(request['scene'], request['subject'], supervisor)
+        elif request['ask'] == 'finish':  # the attempt has a score
+            if self._is_attempt and self._recording is not None:
+                self._record(False, supervisor)
+        elif request['ask'] == 'watch':
+            bags = [self._attempts.bag(name) for name in request['bags']]
+            self._replays.show(bags, int(request['number']))
         elif request['ask'] == 'state':  # the viewer has just started
             self._is_new = True
+            self._attempts.refresh()
         elif request['ask'] == 'record' and request.get('on') is (self._recording is None):
             self._record(request['on'], supervisor)
+
+    def _begin_attempt(self, name: str, subject: str, supervisor: Supervisor) -> None:
+        """Restart the nodes with an exercise, and record it from the start."""
+        if name not in scene_names() or not (scene := load_scene(name)).exercise.title:
+            raise SessionError('the requested exercise is not one of those on offer')
+        self._subject = str(subject) or self._subject
+        self._restart(name, scene.cutting.method, supervisor, attempt=True)
 
     def _record(self, on: bool, supervisor: Supervisor) -> None:
         """Start a bag, or end the present one."""
@@ -241,27 +293,39 @@ class _Session:
         self._answer(supervisor, busy=busy)
         if on:
             bag = new_bag(None, self._scene.name)
-            command = recorder_command(self._file, bag, self._options.seed)
+            command = self._recorder_command(bag)
             self._recording = bag
             if not supervisor.replace([command]):
                 supervisor.remove([RECORDER_NODE])
                 self._recording = None
                 raise SessionError('the recorder did not start: its log has the reason')
         else:
-            supervisor.remove([RECORDER_NODE])
-            self._recording = None
+            self._end_bag(supervisor)
 
-    def _restart(self, name: str, method: str, supervisor: Supervisor) -> None:
-        """Restart the nodes. A bag holds one tissue: the present one ends, and a new one starts."""
+    def _end_bag(self, supervisor: Supervisor) -> None:
+        supervisor.remove([RECORDER_NODE])
+        self._recording, self._is_attempt = None, False
+        self._attempts.refresh()
+
+    def _restart(
+        self, name: str, method: str, supervisor: Supervisor, *, attempt: bool = False
+    ) -> None:
+        """Restart the nodes. A bag holds one tissue: the present one ends, and a new one starts.
+
+        Args:
+            name: of the scene.
+            method: of cutting.
+            supervisor: of the nodes.
+            attempt: record an attempt from the start.
+        """
         scene = load_scene(self._sources.get(name, name))
         changes = {} if method == scene.cutting.method else {'cutting.method': method}
         if scene.name != self._scene.name and method == self._method:
             changes, method = {}, scene.cutting.method  # another scene has its own method
-        recorded = self._recording is not None
+        recorded, again = self._recording is not None, self._is_attempt
         self._answer(supervisor, busy='The nodes start again ...')
         if recorded:
-            supervisor.remove([RECORDER_NODE])
-            self._recording = None
+            self._end_bag(supervisor)
         before = [command.name for command in self.nodes()]
         self._scene, self._method = scene, method
         self._file = write_changed(scene, self._folder, changes) if changes else scene.path
@@ -272,10 +336,21 @@ class _Session:
             outcome = supervisor.outcome
             why = outcome.unready or (outcome.deaths[-1].sentence if outcome.deaths else '')
             raise SessionError(why or 'the start was interrupted')
-        if recorded:
+        if recorded or attempt:
             self._record(True, supervisor)
+        self._is_attempt = attempt or (again and bool(scene.exercise.title))
 
-    def _answer(self, supervisor: Supervisor, *, busy: str = '', problem: str = '') -> None:
+    def _answer(
+        self, supervisor: Supervisor, *, busy: str = '', problem: str = '', **news: object
+    ) -> None:
+        """Tell the page the state of the session, with what is new.
+
+        Args:
+            supervisor: of the nodes.
+            busy: activity that blocks the session.
+            problem: why a request failed.
+            news: further attributes of `SessionState`.
+        """
         sends_file = self._is_new and not busy
         state = {
             'scene': self._scene.name,
@@ -284,6 +359,7 @@ class _Session:
             'busy': busy,
             'problem': problem,
             'scene_file': str(self._file) if sends_file else '',
+            **news,
         }
         self._is_new = self._is_new and not sends_file
         supervisor.answer(VIEWER_NODE, json.dumps(state))

@@ -28,7 +28,7 @@ from cutting_trainer.viewer.appearance import (
 )
 from cutting_trainer.viewer.colours import OTHER_TISSUE
 from cutting_trainer.viewer.drawn_surface import CUT, TissueSource
-from cutting_trainer.viewer.page_protocol import AnyMessage, Guide, Record, Scale
+from cutting_trainer.viewer.page_protocol import AnyMessage, Guide, Record, Scale, Watch
 from cutting_trainer.viewer.page_server import PageServer
 
 TOKEN = 'stand-in'
@@ -36,6 +36,21 @@ PERIOD = 1 / 30
 SPEED = 0.3
 """[m/s] of the hand."""
 DOWN = 0.7071067811865476
+ATTEMPTS: list[dict[str, Any]] = [
+    {
+        'bag': f'circle-{number}',
+        'subject': 'p-01',
+        'exercise': 'circle',
+        'attempt': number,
+        'begun': 1.7e9 + number,
+        'state': state,
+        'points': points,
+        'passed': points is not None and points > 70,
+    }
+    for number, state, points in (
+        (3, 'broken off', None), (2, 'scored', 91.25), (1, 'scored', 40.0),
+    )
+]  # fmt: skip
 
 
 class StandIn:
@@ -75,6 +90,8 @@ class StandIn:
             scale=(0.1, 3.0),
             bounds=reach(positions),
             session=True,
+            exercises={'circle': 'Precision cutting'},
+            bags=tuple(row['bag'] for row in ATTEMPTS),
         )
         if mode == 'replay':
             self._controls = ReplayControls(20.0, (0.25, 1.0, 4.0))
@@ -139,7 +156,9 @@ class StandIn:
             'methods': ['combined', 'delete'],
             'duration': None if live else 20.0,
             'speeds': [] if live else [0.25, 1.0, 4.0],
+            'exercises': [{'name': 'circle', 'title': 'Precision cutting'}] if live else [],
             'tool': tool_shape(self._scene.tool),
+            'further_tools': [],
             'camera': camera(seen),
             'floor': FLOOR,
             'bounds': {'low': bounds.low, 'high': bounds.high} if live else None,
@@ -165,6 +184,8 @@ class StandIn:
             self.recording = '2026-01-01_12-00-00_liver' if message.on else ''
         elif isinstance(message, Scale):
             self.server.put('scale', value=message.value, min=0.1, max=3.0)
+        elif isinstance(message, Watch):
+            self.server.put('replay', number=message.number, link=f'{self.url}&replay')
         elif word == 'play':
             self._playing = message.on  # type: ignore[union-attr]
         elif word == 'seek':
@@ -201,6 +222,7 @@ class StandIn:
             depth=depth,
             can_guide=self.state == 'ENABLED',
             contact=int(depth > 0),
+            further=[],
         )
         for source in self._sources[: 1 if self._mode == 'live' else 2]:
             if (frame := source.frame(self._tissue)) is not None:
@@ -231,6 +253,7 @@ class StandIn:
                 'text': text.get(self.state, 'No force. Start enables it.'),
                 'e_stopped': self.e_stopped,
             },
+            'attempts': {'rows': ATTEMPTS},
             'session': {
                 'scene': 'liver',
                 'method': 'combined',

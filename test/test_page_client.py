@@ -15,7 +15,15 @@ import pytest
 from page_world import StandIn
 
 from bench.page.browser import CHROMIUM, Browser, Page, chromium
-from cutting_trainer.viewer.page_protocol import EStop, Guide, Play, ResetEStop, Seek
+from cutting_trainer.viewer.page_protocol import (
+    Attempt,
+    EStop,
+    Guide,
+    Play,
+    ResetEStop,
+    Seek,
+    Watch,
+)
 
 pytestmark = [
     pytest.mark.long,
@@ -440,6 +448,31 @@ def test_exercise_is_read_at_every_size_and_stands_beside_the_picture(
             assert 'do not cut' in there['text'] and 'lesion' not in there['text']
         page.resize(1000, 700)
         assert page.says('start') and page.says('end')
+
+
+def test_exercise_is_begun_for_a_subject_and_two_attempts_are_opened_side_by_side(
+    browser: Browser,
+) -> None:
+    with closing(StandIn()) as stand_in, opened(browser, stand_in) as page:
+        rows = "[...document.querySelectorAll('#attempts tr')].map(row => row.cells[2].innerText)"
+        page.wait(lambda: len(page.evaluate(rows)) == 3, 'the attempts')
+        assert page.evaluate(rows) == ['broken off', '✓ 91.3', '✕ 40.0']
+        assert page.evaluate("document.querySelector('#watch').disabled")
+        page.evaluate("document.querySelector('#subject').value = 'p 01 <b>'")
+        page.press('begin')
+        page.evaluate("document.querySelector('#subject').value = 'p-01'")
+        page.press('begin')
+        (asked,) = stand_in.wait(lambda: stand_in.of(Attempt))
+        assert (asked.scene, asked.subject) == ('circle', 'p-01')
+        for bag in ('circle-1', 'circle-3', 'circle-2'):  # no more than two are compared
+            page.evaluate(f"""document.querySelector('#attempts [value="{bag}"]').click()""")
+        assert page.evaluate("document.querySelector('#watch').innerText") == 'Compare the replays'
+        page.evaluate('window.open = () => null')  # as where the browser lets no window open
+        page.press('watch')
+        (watched,) = stand_in.wait(lambda: stand_in.of(Watch))
+        assert watched.bags == ['circle-3', 'circle-2']
+        link = "document.querySelector('#replay:not([hidden])')?.href"
+        assert page.wait(lambda: page.evaluate(link), 'the link').endswith('&replay')
 
 
 def test_page_without_an_exercise_shows_none(browser: Browser) -> None:

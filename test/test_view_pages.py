@@ -358,7 +358,7 @@ def test_server_leaves_no_thread_and_no_socket() -> None:
 def test_page_shows_no_folders_and_follows_what_the_launcher_says(
     stand_in: StandIn, page: OpenPage
 ) -> None:
-    live = LivePage(stand_in.server, ToolSettings(), ExerciseSettings(), CONTROLS)
+    live = LivePage(stand_in.server, [ToolSettings()], ExerciseSettings(), CONTROLS)
     problem = 'no scene /home/somebody/x.yaml'
     live.show_session(SessionState('kidney', 'delete', 'bags/kidney-1', problem=problem))
     live.show_state('FAULT', 'the file /home/somebody/x.yaml is lacking', e_stopped=True)

@@ -27,6 +27,7 @@ from cutting_trainer.session.node_commands import LOCAL
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.viewer.access_control import link, make_gate
 from cutting_trainer.viewer.bag_timeline import ComputedTissue, RecordedTissue, RecordedTool
+from cutting_trainer.viewer.recording import Recording, computed_beside
 from cutting_trainer.viewer.replay_page import ReplayPage
 
 pytestmark = pytest.mark.long
@@ -125,9 +126,8 @@ def test_changed_tissue_goes_another_way(bag: Bag, scene: Scene, tmp_path: Path)
 
 @pytest.fixture
 def page(bag: Bag, scene: Scene, again: ComputedTissue) -> Iterator[ReplayPage]:
-    page = ReplayPage(
-        bag, scene.tool, scene.device, scene.exercise, again, 'computed again', LOCAL, 0, GATE
-    )
+    recording = Recording(bag, scene.tool, scene.device, scene.exercise)
+    page = ReplayPage(recording, computed_beside('computed again', again), LOCAL, 0, GATE)
     yield page
     page.server.stop()
 
@@ -152,7 +152,7 @@ def test_page_goes_where_the_time_line_is_put(page: ReplayPage, bag: Bag) -> Non
 
         reader.wait(shows, 'the moment')
         used = np.unique(wanted.triangles[wanted.triangle_kind == 0])
-        for name in ('tissue', 'computed'):
+        for name in ('tissue', 'beside'):
             moved = reader.values[name][0][0]
             np.testing.assert_allclose(moved, wanted.positions()[used], atol=1e-6)
     reader.close()

@@ -1,15 +1,18 @@
 """Allowed requests of pages: one rule for the server that checks and the page that shows it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from cutting_trainer.viewer.page_protocol import (
     AnyMessage,
+    Attempt,
     Choose,
     Guide,
     Record,
     Scale,
     Seek,
     Speed,
+    Watch,
 )
 
 _NO_LAUNCHER = 'This needs the launcher: the page shows a graph that was started elsewhere.'
@@ -46,6 +49,8 @@ class LiveControls:
         can_guide: whether the hand follows goals.
         e_stopped: whether an E-STOP holds.
         recording: whether a bag is in progress.
+        exercises: titles of the exercises on offer, by scene.
+        bags: names of the attempts' bags.
     """
 
     scenes: tuple[str, ...] = ()
@@ -57,11 +62,13 @@ class LiveControls:
     can_guide: bool = False
     e_stopped: bool = False
     recording: bool = False
+    exercises: Mapping[str, str] = field(default_factory=dict)
+    bags: tuple[str, ...] = ()
 
     def refused(self) -> dict[str, str]:
         """Return why an op is not allowed whatever its values, by op."""
         found = {}
-        asks_launcher = ('reset', 'record', 'choose')
+        asks_launcher = ('reset', 'record', 'choose', 'attempt', 'watch')
         if not self.session or self.busy:
             why = self.busy if self.session else _NO_LAUNCHER
             found = dict.fromkeys(asks_launcher, why)
@@ -79,6 +86,10 @@ class LiveControls:
             message.scene in self.scenes and message.method in self.methods
         ):
             return 'Choose a scene and a method from the lists.'
+        if isinstance(message, Attempt) and message.scene not in self.exercises:
+            return 'Choose an exercise from the list.'
+        if isinstance(message, Watch) and not set(message.bags) <= set(self.bags):
+            return 'Choose attempts from the list.'
         if isinstance(message, Scale) and not self.scale[0] <= message.value <= self.scale[1]:
             return f'The force scale is from {self.scale[0]:g} to {self.scale[1]:g}.'
         if isinstance(message, Guide) and self.bounds and not self.bounds.contain(message.position):

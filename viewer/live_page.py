@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
@@ -75,6 +75,8 @@ class SessionState:
         busy: activity that blocks the session, '' when there is none.
         problem: why a request failed, '' when none did.
         scene_file: path, where the nodes read another scene from now on; else ''.
+        attempts: list of attempts, newest first, where it has changed; else None.
+        replay: number and link of the newest replay that was asked for; None: none.
     """
 
     scene: str
@@ -83,6 +85,8 @@ class SessionState:
     busy: str = ''
     problem: str = ''
     scene_file: str = ''
+    attempts: list[dict[str, Any]] | None = None
+    replay: tuple[int, str] | None = None
 
 
 class LivePage:
@@ -92,19 +96,22 @@ class LivePage:
 
     Args:
         server: of the pages.
-        tool: to draw.
+        tools: to draw, the first one first.
         exercise: to show.
         controls: allowed requests at the beginning.
+
+    Attributes:
+        scored: whether the attempt at the exercise is over and has a score.
     """
 
     def __init__(
         self,
         server: PageServer,
-        tool: ToolSettings,
+        tools: Sequence[ToolSettings],
         exercise: ExerciseSettings,
         controls: LiveControls,
     ) -> None:
-        self._server, self._tool, self._controls = server, tool, controls
+        self._server, self._tools, self._controls = server, tools, controls
         self._begin_exercise(exercise)
         self._source = TissueSource(TISSUE)
         self._history = History(4, _SAMPLES)
@@ -129,7 +136,11 @@ class LivePage:
             methods=self._controls.methods,
             duration=None,
             speeds=[],
-            tool=tool_shape(self._tool),
+            exercises=[
+                {'name': name, 'title': title} for name, title in self._controls.exercises.items()
+            ],
+            tool=tool_shape(self._tools[0]),
+            further_tools=[tool_shape(tool) for tool in self._tools[1:]],
             camera=None if positions is None else camera(positions),
             floor=FLOOR,
             bounds=None if bounds is None else {'low': bounds.low, 'high': bounds.high},
@@ -145,14 +156,14 @@ class LivePage:
             self._controls = changed
             self._server.allow(changed)
 
-    def equip(self, tool: ToolSettings, exercise: ExerciseSettings) -> None:
-        """Replace the drawn tool and the exercise, for another tissue."""
-        self._tool, self._gauge = tool, None
+    def equip(self, tools: Sequence[ToolSettings], exercise: ExerciseSettings) -> None:
+        """Replace the drawn tools and the exercise, for another tissue."""
+        self._tools, self._gauge = tools, None
         self._begin_exercise(exercise)
         self._server.put('attempt', rows=[], score=None)
 
     def _begin_exercise(self, exercise: ExerciseSettings) -> None:
-        self._exercise = exercise
+        self._exercise, self.scored = exercise, False
         self._progress = AttemptProgress(exercise) if exercise.title else None
 
     def show(
@@ -163,6 +174,7 @@ class LivePage:
         rates: tuple[float, float],
         *,
         can_guide: bool,
+        further: Sequence[dict[str, Any] | None] = (),
     ) -> None:
         """Show the newest state.
 
@@ -172,6 +184,7 @@ class LivePage:
             moment: of the tool, None before it is known.
             rates: of force loop and tissue, as shares of their nominal ones.
             can_guide: whether the hand follows goals.
+            further: as in `put_moment`.
         """
         self._now = now
         if replica.revision >= 0:
@@ -184,7 +197,7 @@ class LivePage:
         depth = force = 0.0
         if moment is not None and moment.is_finite:
             force, depth = float(np.linalg.norm(moment.force)), self._depth(moment)
-            put_moment(self._server, moment, depth, can_guide=can_guide)
+            put_moment(self._server, moment, depth, can_guide=can_guide, further=further)
             self._show_progress(now, replica, moment)
         self._history.add(now, force, depth, *rates)
         if now >= self._next_plot:
@@ -195,7 +208,17 @@ class LivePage:
         if self._progress is None or replica.revision < 0:
             return
         if (content := self._progress.see(now, replica, moment)) is not None:
+            self.scored = content['score'] is not None
             self._server.put('attempt', **content)
+
+    def show_attempts(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Show the list of attempts, newest first."""
+        self._allow(bags=tuple(row['bag'] for row in rows))
+        self._server.put('attempts', rows=list(rows))
+
+    def show_replay(self, number: int, link: str) -> None:
+        """Show where the replay that was asked for is served."""
+        self._server.put('replay', number=number, link=link)
 
     def _depth(self, moment: Moment) -> float:
         if self._gauge is None:
@@ -249,6 +272,10 @@ class LivePage:
         self._busy = state.busy
         if state.problem:
             self.warn(state.problem)
+        if state.attempts is not None:
+            self.show_attempts(state.attempts)
+        if state.replay is not None:
+            self.show_replay(*state.replay)
         scenes = self._controls.scenes
         if scene not in scenes:
             scenes = (*scenes, scene)
@@ -264,13 +291,22 @@ class LivePage:
         )
 
 
-def put_moment(server: PageServer, moment: Moment, depth: float, *, can_guide: bool) -> None:
+def put_moment(
+    server: PageServer,
+    moment: Moment,
+    depth: float,
+    *,
+    can_guide: bool,
+    further: Sequence[dict[str, Any] | None] = (),
+) -> None:
     """Show the pose of the tool and the force on the hand.
 
     Args:
         server: of the pages.
         moment: to show; a moment that is not finite is skipped.
         depth: of the blade's end [m].
+        can_guide: whether the hand follows goals.
+        further: tip [m] and wxyz of each further tool; None: it is not known.
         can_guide: whether the hand follows goals.
     """
     if not moment.is_finite:
@@ -284,6 +320,7 @@ def put_moment(server: PageServer, moment: Moment, depth: float, *, can_guide: b
         depth=depth,
         can_guide=can_guide,
         contact=moment.contact,
+        further=list(further),
     )
 
 

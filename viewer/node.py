@@ -18,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from visualization_msgs.msg import MarkerArray
 
-from cutting_trainer.exercises.scene_schema import ExerciseSettings
+from cutting_trainer.exercises.scene_schema import ExerciseSettings, exercise_titles
 from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.node_common import qos, ros
@@ -35,11 +35,13 @@ from cutting_trainer.tissue_sim.streaming.mesh_follower import MeshFollower
 from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, is_local, link, make_gate
 from cutting_trainer.viewer.allowed_requests import LiveControls
 from cutting_trainer.viewer.diagnostics_table import Statuses
+from cutting_trainer.viewer.further_tools import FurtherTool, further_tools
 from cutting_trainer.viewer.live_page import METHODS, LivePage, SessionState
 from cutting_trainer.viewer.markers import Colouring, Markers
 from cutting_trainer.viewer.operator_commands import BRIDGE, Operation
 from cutting_trainer.viewer.page_protocol import (
     AnyMessage,
+    Attempt,
     Choose,
     EStop,
     Guide,
@@ -49,12 +51,13 @@ from cutting_trainer.viewer.page_protocol import (
     ResetEStop,
     Scale,
     Start,
+    Watch,
 )
 from cutting_trainer.viewer.page_server import PageServer
 from cutting_trainer.viewer.pending_requests import Requests, taken
 from cutting_trainer.viewer.ring_buffers import StreamRate
 from cutting_trainer.viewer.tf_frames import StaticFrames
-from cutting_trainer.viewer.tool_state import Moment, Translator
+from cutting_trainer.viewer.tool_state import Moment, Translator, drawn
 from cutting_trainer.viewer.topic_rate import Stream
 
 MARKER_PERIOD_S = 0.1
@@ -93,6 +96,7 @@ class ViewerNode(ManagedNode):
         self._colouring = self._marker_colours()
         text = 'a launcher reads standard output and answers on standard input'
         self._launched = bool(parameter(self, 'session', False, text))
+        self._further: list[FurtherTool] = []
         self._take_scene(scene)
         self._follower = MeshFollower(self, self.rejections)
         self._contact = Stream(self, Contact, ros.CONTACT, ContactCodec())
@@ -115,6 +119,7 @@ class ViewerNode(ManagedNode):
             self, lambda text: self._calls.put(lambda: self._page.warn(text)), tool_names(scene)
         )
         self._open_page()
+        self._scored = False
         self._loop = PeriodicLoop(RATE_HZ)
         self._next_markers = 0.0
         self._diagnostics = ros.Diagnostics(self, self._status)
@@ -126,12 +131,15 @@ class ViewerNode(ManagedNode):
         text = 'names of the page in requests, separated by commas'
         names = [n for n in str(parameter(self, 'allow_host', '', text)).split(',') if n]
         gate = make_gate(host, names, os.environ.get(TOKEN_VARIABLE, ''))
-        controls = LiveControls(tuple(scene_names()), METHODS, session=self._launched)
+        exercises = exercise_titles() if self._launched else {}
+        controls = LiveControls(
+            tuple(scene_names()), METHODS, session=self._launched, exercises=exercises
+        )
         self._server = PageServer(host, port, gate, 'live', controls, self._act)
         self._link = link(host, self._server.port, names, gate.token)
         if not is_local(host):
             self._link += f' {OPEN_LINK_WARNING}'
-        self._page = LivePage(self._server, self._tool, self._exercise, controls)
+        self._page = LivePage(self._server, self._tools, self._exercise, controls)
         self._page.show_scale(self._force_scale)
 
     def _marker_colours(self) -> tuple[Any, float]:
@@ -148,7 +156,11 @@ class ViewerNode(ManagedNode):
         device = read_section(scene, 'device', DeviceSettings)
         self._force_topic = f'{ros.ARM}/{device.force_topic}'
         self._translator = Translator(device)
-        self._tool = read_section(scene, 'tool', ToolSettings)
+        tool = read_section(scene, 'tool', ToolSettings)
+        for other in self._further:
+            other.close()
+        self._further = further_tools(self, scene)
+        self._tools = [tool, *(other.tool for other in self._further)]
         self._exercise = read_section(scene, 'exercise', ExerciseSettings)
         haptics = read_section(scene, 'haptics', HapticsSettings)
         tissue = read_section(scene, 'tissue', TissueSettings)
@@ -201,7 +213,13 @@ class ViewerNode(ManagedNode):
         )
         operation = self._operation
         can_guide = operation.can_guide
-        self._page.show(now, self._follower.replica, moment, rates, can_guide=can_guide)
+        further = [drawn(other.moment(now)) for other in self._further]
+        self._page.show(
+            now, self._follower.replica, moment, rates, can_guide=can_guide, further=further
+        )
+        if self._page.scored and not self._scored:
+            self._ask_launcher(ask='finish')
+        self._scored = self._page.scored
         said = self._state_text(now, can_guide=can_guide)
         self._page.show_state(str(operation.state or ''), said, e_stopped=operation.e_stopped)
         self._page.show_nodes(now, self._statuses.now(now))
@@ -228,7 +246,7 @@ class ViewerNode(ManagedNode):
             return
         if self._marker_array.get_subscription_count() > 0:
             self._next_markers = now + MARKER_PERIOD_S
-            data = self._markers.array(replica, moment, self._tool.radius, time.time_ns())
+            data = self._markers.array(replica, moment, self._tools[0].radius, time.time_ns())
             self._marker_array.publish(data)
 
     # Requests of pages
@@ -257,6 +275,10 @@ class ViewerNode(ManagedNode):
                 self._ask_launcher(ask='record', on=message.on)
             case Choose():
                 self._ask_launcher(ask='restart', scene=message.scene, method=message.method)
+            case Attempt():
+                self._ask_launcher(ask='attempt', scene=message.scene, subject=message.subject)
+            case Watch():
+                self._ask_launcher(ask='watch', bags=message.bags, number=message.number)
             case Scale():
                 self._scale(message.value)
 
@@ -290,7 +312,7 @@ class ViewerNode(ManagedNode):
         if answer.scene_file:
             self._take_scene(Path(answer.scene_file))
             self._frames.place(self._device)
-            self._page.equip(self._tool, self._exercise)
+            self._page.equip(self._tools, self._exercise)
             self._statuses.take_scale()
             self._page.show_scale(self._force_scale)
         if answer.busy:

@@ -10,16 +10,18 @@ the one before:
 
 | type | fields |
 |---|---|
-| hello | version, mode, title, session, scenes, methods, duration, speeds, tool, camera, floor, bounds, metres_per_newton, tissues, plots_span, exercise: null where the scene is none |
+| hello | version, mode, title, session, scenes, methods, exercises of name and title, duration, speeds, tool, further_tools, camera, floor, bounds, metres_per_newton, tissues, plots_span, exercise: null where the scene is none |
 | controls | refused: sentence by op; every other op of the mode is allowed |
 | state | state, text, e_stopped |
 | nodes | rows of name, level, message, rate |
 | session | scene, method, recording, busy, scenes |
 | scale | value, min, max |
-| moment | tip, wxyz, proxy, force, depth, can_guide, contact |
+| moment | tip, wxyz, proxy, force, depth, can_guide, contact, further: tip and wxyz of each further tool, null where it is not known |
 | plots | span, lines of title, unit, times, values and colours by name, least |
 | playhead | time, playing, speed |
 | attempt | rows of name, value, over; score: null, or points, passed, reasons once the tip is back at the end |
+| attempts | rows of bag, subject, exercise, attempt, begun, state, points, passed, newest first |
+| replay | number: of the request, link: to open |
 | notice | id, text |
 | refused | op, why: only to the page that asked |
 | pong | id: the same, age: of the newest session update [s] |
@@ -105,6 +107,22 @@ class Choose(PageMessage):
     method: Name
 
 
+class Attempt(PageMessage):
+    """Restart the nodes with an exercise, and record the attempt of a subject from its start."""
+
+    op: Literal['attempt']
+    scene: Name
+    subject: Annotated[str, Field(max_length=MAX_NAME, pattern=r'^[A-Za-z0-9_.-]*$')]
+
+
+class Watch(PageMessage):
+    """Serve the replay of an attempt, or of two side by side; the answer has the same number."""
+
+    op: Literal['watch']
+    bags: Annotated[list[Name], Field(min_length=1, max_length=2)]
+    number: Annotated[int, Field(ge=0, le=2**53)]
+
+
 class Scale(PageMessage):
     """Set the ratio of the hand's force to the tissue's."""
 
@@ -154,7 +172,8 @@ class Speed(PageMessage):
 
 
 LiveMessage = (
-    EStop | ResetEStop | Start | Pause | Reset | Record | Choose | Scale | Guide | Ping
+    EStop | ResetEStop | Start | Pause | Reset | Record | Choose | Attempt | Watch | Scale | Guide
+    | Ping
 )  # fmt: skip
 ReplayMessage = Play | Seek | Speed | Ping
 AnyMessage = LiveMessage | ReplayMessage

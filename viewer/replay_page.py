@@ -1,18 +1,11 @@
-"""Page of a recorded session: time line, and a computed tissue beside the recorded one."""
+"""Page of a recorded session: time line, and another tissue beside the recorded one."""
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from cutting_trainer.bags.playback_control import Playhead
-from cutting_trainer.bags.playback_messages import duration
-from cutting_trainer.bags.reader import Bag
-from cutting_trainer.bags.recorded_indexings import indexing_at
-from cutting_trainer.exercises.scene_schema import ExerciseSettings
-from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings
-from cutting_trainer.tissue_sim.mesh.depth import SurfaceDepth
 from cutting_trainer.viewer.access_control import Gate
 from cutting_trainer.viewer.allowed_requests import ReplayControls
 from cutting_trainer.viewer.appearance import (
@@ -24,77 +17,65 @@ from cutting_trainer.viewer.appearance import (
     shown_tissue,
     tool_shape,
 )
-from cutting_trainer.viewer.bag_timeline import ComputedTissue, RecordedTissue, RecordedTool
-from cutting_trainer.viewer.colours import OTHER_TISSUE
+from cutting_trainer.viewer.colours import OTHER_TISSUE, TISSUE
 from cutting_trainer.viewer.drawn_surface import TissueSource
 from cutting_trainer.viewer.live_page import put_moment
 from cutting_trainer.viewer.page_protocol import VERSION, AnyMessage, Play, Seek, Speed
 from cutting_trainer.viewer.page_server import PageServer
 from cutting_trainer.viewer.pending_requests import Requests
 from cutting_trainer.viewer.plots import BLUE, DEPTH, FORCE, ORANGE, Plot
-from cutting_trainer.viewer.tool_state import Floats, Translator
+from cutting_trainer.viewer.recording import Beside, Recording
+from cutting_trainer.viewer.tool_state import Floats, drawn
 
 RATE_HZ = 30.0
 """[Hz] Largest update rate of the page."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
-RECORDED, COMPUTED = 'tissue', 'computed'
+RECORDED, BESIDE = 'tissue', 'beside'
 """Names of the tissues on the page."""
 _PLOT_POINTS = 1000
 """Number of points of a plot."""
 
 
 class ReplayPage:
-    """Shows a bag.
+    """Shows a recorded session.
 
     Args:
-        bag: to read.
-        tool, device, exercise: sections of its scene.
-        computed: a tissue to show beside the recorded one; None: none.
-        name: of the computed tissue.
+        recording: to show.
+        beside: shown beside it; None: nothing.
         host, port: address of the page.
         gate: access rules.
 
     Raises:
-        BagError: the bag has no tissue.
         PageError: the page cannot be served at this address.
     """
 
     def __init__(
-        self,
-        bag: Bag,
-        tool: ToolSettings,
-        device: DeviceSettings,
-        exercise: ExerciseSettings,
-        computed: ComputedTissue | None,
-        name: str,
-        host: str,
-        port: int,
-        gate: Gate,
+        self, recording: Recording, beside: Beside | None, host: str, port: int, gate: Gate
     ) -> None:
-        self._recorded, self._track = RecordedTissue(bag), RecordedTool(bag)
-        self._computed, self._translator = computed, Translator(device)
-        self._sources = TissueSource(RECORDED), TissueSource(COMPUTED)
-        self._end = duration(bag)
+        self._recording, self._beside = recording, beside
+        self._sources = TissueSource(RECORDED), TissueSource(BESIDE)
+        self._end = max(recording.end, beside.end if beside else 0.0)
         self._playhead = Playhead(0.0, self._end)
-        first = self._recorded.go_to(0.0)
-        tips = self._track.contact.vectors('blade_tip')
-        self._depths = SurfaceDepth(first).depths(tips)
+        positions = recording.tissue.go_to(0.0).positions()
+        self._apart = np.array([TISSUE_SPACING * float(np.ptp(positions[:, 0])), 0.0, 0.0])
         self._shown = -1.0
         self._asked = Requests()
         controls = ReplayControls(self._end, SPEEDS)
         self.server = PageServer(host, port, gate, 'replay', controls, self._ask)
-        self._hello(first.positions(), tool, exercise, name)
-        self._plot(name)
+        self._hello(positions)
+        self._plot()
 
-    def _hello(
-        self, positions: Floats, tool: ToolSettings, exercise: ExerciseSettings, name: str
-    ) -> None:
-        apart = TISSUE_SPACING * float(np.ptp(positions[:, 0]))
-        tissues = [shown_tissue(RECORDED, 'recorded' if self._computed else '')]
-        seen = [positions]
-        if self._computed is not None:
-            tissues.append(shown_tissue(COMPUTED, name, OTHER_TISSUE, apart))
-            seen.append(positions + np.array([apart, 0.0, 0.0]))
+    def _hello(self, positions: Floats) -> None:
+        recording, beside = self._recording, self._beside
+        named, tools = '', []
+        tissues, seen = [], [positions]
+        if beside is not None:
+            named = 'recorded' if beside.recording is None else recording.bag.path.name
+            colour = OTHER_TISSUE if beside.recording is None else TISSUE
+            tissues.append(shown_tissue(BESIDE, beside.name, colour, float(self._apart[0])))
+            seen.append(positions + self._apart)
+            if beside.recording is not None:
+                tools.append(tool_shape(beside.recording.tool))
         self.server.put(
             'hello',
             version=VERSION,
@@ -103,33 +84,36 @@ class ReplayPage:
             session=False,
             scenes=[],
             methods=[],
+            exercises=[],
             duration=self._end,
             speeds=SPEEDS,
-            tool=tool_shape(tool),
+            tool=tool_shape(recording.tool),
+            further_tools=tools,
             camera=camera(np.concatenate(seen)),
             floor=FLOOR,
             bounds=None,
             metres_per_newton=METRES_PER_NEWTON,
-            tissues=tissues,
+            tissues=[shown_tissue(RECORDED, named), *tissues],
             plots_span=self._end,
-            exercise=shown_exercise(exercise),
+            exercise=shown_exercise(recording.exercise),
         )
 
-    def _plot(self, name: str) -> None:
-        wrench, force = self._track.wrench, self._track.force
+    def _plot(self) -> None:
+        recording, beside = self._recording, self._beside
+        wrench = recording.track.wrench
         times = np.linspace(0.0, self._end, _PLOT_POINTS)
         hand = np.linalg.norm(wrench.vectors('force'), axis=1)
         colours = {'recorded': BLUE}
-        felt = [resampled(times, force.times, np.linalg.norm(force.vectors('force'), axis=1))]
-        if self._computed is not None:
-            colours[name] = ORANGE
-            known = np.array(self._computed.times), np.array(self._computed.forces)
-            felt.append(resampled(times, *known))
-        depths = 1e3 * self._depths
+        felt = [resampled(times, *recording.felt)]
+        if beside is not None:
+            colours = {'recorded' if beside.recording is None else 'left': BLUE}
+            colours[beside.name if beside.recording is None else 'right'] = ORANGE
+            felt.append(resampled(times, *beside.felt))
+        depths = 1e3 * recording.depths
         lines = (
             FORCE.lines(times, resampled(times, wrench.times, hand)),
             Plot('Force of the tissue', 'N', colours, 0.5).lines(times, *felt),
-            DEPTH.lines(times, resampled(times, self._track.contact.times, depths)),
+            DEPTH.lines(times, resampled(times, recording.track.contact.times, depths)),
         )
         self.server.put('plots', span=[0.0, self._end], lines=lines)
 
@@ -174,12 +158,7 @@ class ReplayPage:
         if position != self._shown:
             self._shown = position
             self._show_tissues(position)
-            contact = self._track.contact.at(position)
-            if contact is not None:
-                pose, wrench = self._track.pose.at(position), self._track.wrench.at(position)
-                indexing = indexing_at(self._track.indexings, contact.stamp_ns)
-                moment = self._translator.moment(contact, pose, wrench, indexing)
-                put_moment(self.server, moment, self._depth(position), can_guide=False)
+            self._show_tools(position)
         self.server.put(
             'playhead',
             time=round(position, 3),
@@ -188,16 +167,23 @@ class ReplayPage:
         )
 
     def _show_tissues(self, position: float) -> None:
-        tissues: list[Any] = [self._recorded.go_to(position)]
-        if self._computed is not None:
-            tissues.append(self._computed.go_to(position))
+        tissues = [self._recording.tissue.go_to(position)]
+        if self._beside is not None:
+            tissues.append(self._beside.tissue.go_to(position + self._beside.later))
         for source, tissue in zip(self._sources, tissues, strict=False):
             if (frame := source.frame(tissue)) is not None:
                 self.server.put_tissue(frame)
 
-    def _depth(self, position: float) -> float:
-        at = int(np.searchsorted(self._track.contact.times, position, 'right')) - 1
-        return float(self._depths[max(at, 0)])
+    def _show_tools(self, position: float) -> None:
+        moment, further = self._recording.moment(position), []
+        if self._beside is not None and self._beside.recording is not None:
+            other = self._beside.recording.moment(position + self._beside.later)
+            if other is not None:
+                other = other._replace(tip=other.tip + self._apart)
+            further.append(drawn(other))
+        if moment is not None:
+            depth = self._recording.depth(position)
+            put_moment(self.server, moment, depth, further=further, can_guide=False)
 
 
 def resampled(times: Floats, known: Floats, values: Floats) -> Floats:

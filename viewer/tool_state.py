@@ -1,6 +1,6 @@
 """State of the tool at one moment, in the tissue frame, from the messages of device and bridge."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,3 +88,10 @@ class Translator:
             contact=int(get('state')[0]),
             force=force,
         )
+
+
+def drawn(moment: Moment | None) -> dict[str, Any] | None:
+    """Return a further tool in the format of the message `moment`; None: nothing is to be drawn."""
+    if moment is None or not moment.is_finite:
+        return None
+    return {'tip': moment.tip.tolist(), 'wxyz': moment.orientation.tolist()}

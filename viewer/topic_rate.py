@@ -24,7 +24,12 @@ class Stream:
         self.newest: Any = None
         self.counter = StreamRate()
         self._codec, self._topic, self._rejections = codec, topic, node.rejections
+        self._node = node
         self._subscription = ros.polled(node, message_type, topic, qos.NEWEST_BEST_EFFORT)
+
+    def close(self) -> None:
+        """End the subscription."""
+        self._node.destroy_subscription(self._subscription)
 
     def poll(self, now: float) -> None:
         """Take the messages that have arrived by a time [s]."""

@@ -17,6 +17,7 @@ from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.session.node_commands import LOCAL
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.viewer.access_control import link, make_gate
+from cutting_trainer.viewer.recording import Recording
 from cutting_trainer.viewer.replay_page import ReplayPage
 
 _MAX_PLAYED_S = 60.0
@@ -74,7 +75,8 @@ def main() -> None:
     given = parser.parse_args()
     bag, scene = open_bag(given.bag), load_scene(given.scene)
     gate = make_gate(LOCAL, [])
-    page = ReplayPage(bag, scene.tool, scene.device, scene.exercise, None, '', LOCAL, 0, gate)
+    recording = Recording(bag, scene.tool, scene.device, scene.exercise)
+    page = ReplayPage(recording, None, LOCAL, 0, gate)
     page.seek(given.at)
     ended: list[bool] = []
     Thread(target=page.run, args=(lambda: bool(ended),), daemon=True).start()

@@ -34,6 +34,8 @@ CONTROLS = LiveControls(
     bounds=Bounds((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)),
     session=True,
     can_guide=True,
+    exercises={'circle': 'Precision cutting'},
+    bags=('circle-1', 'circle-2'),
 )
 UNLIMITED = PageLimits(rate=1e9, burst=1e9, byte_rate=1e12, byte_burst=1e12, openings=1e9)
 """No limits, so that every message reaches the protocol."""
@@ -46,6 +48,8 @@ VALID: dict[str, dict[str, Any]] = {
     'reset': {},
     'record': {'on': True},
     'choose': {'scene': 'liver', 'method': 'delete'},
+    'attempt': {'scene': 'circle', 'subject': 'p-01'},
+    'watch': {'bags': ['circle-1', 'circle-2'], 'number': 1},
     'scale': {'value': 1.5},
     'guide': {'position': HERE, 'wxyz': (1.0, 0.0, 0.0, 0.0)},
 }

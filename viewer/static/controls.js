@@ -31,7 +31,7 @@ export class Controls {
     for (const id of ['scene', 'method']) $(id).addEventListener('change', () => this._choose());
     $('scale').addEventListener('input', () => this._scale(false));
     $('scale').addEventListener('change', () => this._scale(true));
-    this._hints = Object.fromEntries(['start', 'pause', 'reset', 'record'].map((id) => [id, $(id).title]));
+    this._hints = Object.fromEntries(['start', 'pause', 'reset', 'record', 'begin'].map((id) => [id, $(id).title]));
   }
 
   begin(hello) {
@@ -112,6 +112,7 @@ export class Controls {
     stand('record', 'record');
     stand('scene', 'choose');
     stand('method', 'choose');
+    stand('begin', 'attempt');
     stand('scale', 'scale');
   }
 

@@ -9,6 +9,7 @@ import { Plots } from './plots.js';
 import { Stop } from './stop.js';
 import { Task } from './task.js';
 import { TimeLine } from './timeline.js';
+import { Training } from './training.js';
 
 const $ = (id) => document.getElementById(id);
 const query = new URLSearchParams(location.search);
@@ -28,6 +29,7 @@ const controls = new Controls(send);
 const stop = new Stop($('e-stop'), $('reset-e-stop'), connection, (text) => notices.say(text, 'bad'));
 const timeline = new TimeLine(send);
 const task = new Task();
+const training = new Training(send, (text) => notices.say(text));
 new Gamepad(() => guide, () => stop.active && stop.press());
 let plots = new Plots($('plots'), null);
 
@@ -61,6 +63,8 @@ const takers = {
     guide?.show();
   },
   attempt: (message) => task.show(message),
+  attempts: (message) => training.show(message),
+  replay: (message) => training.open(message),
   plots: (message) => {
     seen.plots += 1;
     plots.show(message);
@@ -113,6 +117,8 @@ function begin(hello) {
   controls.begin(hello);
   timeline.begin(hello);
   task.begin(hello.exercise);
+  training.begin(hello);
+  $('training').hidden = !hello.session;
   onStage(() => {
     stage.begin(hello);
     guide.bounds = hello.bounds ?? null;

@@ -49,6 +49,7 @@ export class Stage {
     this._light();
     this.floor = new Floor(this.scene, !slow);
     this.tool = new Tool(this.scene);
+    this.further = [];
     this.proxy = new Proxy(this.scene);
     this.arrow = new Arrow(this.scene);
     this.marks = new TipMarks(this.scene);
@@ -93,6 +94,7 @@ export class Stage {
     this._label(hello.tissues, this.ends.show(hello.exercise));
     this._inkTissues(hello.exercise);
     this.tool.equip(hello.tool);
+    this._equipFurther(hello.further_tools);
     this._radius = hello.tool.radius;
     if (hello.camera !== null) this._frame(hello.camera);
     const centre = hello.camera?.target ?? [0, 0, 0];
@@ -101,6 +103,14 @@ export class Stage {
     this.floor.lay({ z: hello.floor?.z ?? 0, size, centre });
     this._shade();
     this.invalidate();
+  }
+
+  _equipFurther(shapes) {
+    for (const tool of this.further.splice(shapes.length)) tool.dispose(this.scene);
+    shapes.forEach((shape, index) => {
+      this.further[index] ??= new Tool(this.scene);
+      this.further[index].equip(shape);
+    });
   }
 
   _inkTissues(exercise) {
@@ -180,6 +190,7 @@ export class Stage {
   takeMoment(moment) {
     this.moment = moment;
     this.tool.place(moment);
+    moment.further.forEach((place, index) => this.further[index]?.place(place));
     this.proxy.place(this._radius, moment.proxy);
     this.arrow.place(moment.tip, moment.force);
     this._mark();

@@ -52,8 +52,18 @@ export class Tool {
     }
   }
 
+  /** @param {object|null} moment null: it is not known where it is */
   place(moment) {
-    put(this.group, moment.tip, moment.wxyz);
+    if (moment === null) this.group.visible = false;
+    else put(this.group, moment.tip, moment.wxyz);
+  }
+
+  /** Takes it out of the scene for good. */
+  dispose(scene) {
+    for (const group of [this.group, this.ghost]) {
+      empty(group);
+      scene.remove(group);
+    }
   }
 
   showGoal(goal) {
