@@ -33,7 +33,7 @@ PROGRAMS = (
     r'(?:\./trainer|python|ros2|colcon|sudo|pip|source|eval|rviz2|ssh|pre-commit|cd|\.trainer/)'
 )
 PLACES = {
-    r'bags/sessions/(NAME|first)\b': 'BAG',
+    r'bags/sessions/(NAME|OTHER|first)\b': 'BAG',
     r'(picture BAG -o) first': r'\1 liver',
     r'(report BAG -o) first': r'\1 report',
     r'\b(SCENE|NAME)\b': 'block',
@@ -104,6 +104,7 @@ PROGRAMS_OF_OWN = {
 """Run here by a process, and what they say."""
 SHOWN = {
     'view --bag BAG': 'http://127.0.0.1:',
+    'view --bag BAG --beside BAG': 'http://127.0.0.1:',
     'view --bag BAG --resimulate': 'http://127.0.0.1:',
     'view --bag BAG --with tissue.material.toughness=40': 'http://127.0.0.1:',
     'view --attach': 'viewer is ready',

@@ -1,6 +1,7 @@
 """Claims about the launcher behind a page: what it does for lines, and what it tells back."""
 
 import json
+import socket
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ from cutting_trainer.session.progress import SessionProgress
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.session.supervisor import Event
 from cutting_trainer.session.view_command import ViewOptions, _Session, run_view
-from cutting_trainer.viewer.access_control import PageError
+from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, PageError
 
 pytestmark = pytest.mark.long
 
@@ -148,3 +149,71 @@ def test_lines_for_the_launcher_that_are_broken_or_no_objects_are_nothing() -> N
     ):
         assert parse_message(line) is None
     assert parse_message('{"ask": "state"}') == {'ask': 'state'}
+
+
+class Ended:
+    """A program of the trainer that has ended with an output."""
+
+    def __init__(self, status: int, output: str) -> None:
+        self.status, self._output, self.ended = status, output.encode(), False
+
+    def output(self) -> bytes:
+        return self._output
+
+    def end(self) -> None:
+        self.ended = True
+
+
+def row(number: int, state: str = 'scored') -> dict[str, Any]:
+    about = {'subject': 'p-01', 'exercise': 'vessel', 'attempt': number, 'begun': float(number)}
+    return about | {'bag': f'/secret/vessel-{number}', 'state': state, 'points': 1, 'passed': True}
+
+
+def test_attempts_are_told_newest_first_without_folders_and_their_replay_is_served_beside(
+    launched: Launched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, ...]] = []
+    rows = json.dumps([row(1), row(2, 'bag is gone'), row(3)])
+    monkeypatch.setenv(TOKEN_VARIABLE, 'of-this-test')
+
+    def program(*words: str) -> Any:
+        asked.append(words)
+        return Ended(0, rows) if words[0] == 'attempts' else SimpleNamespace(status=None)
+
+    monkeypatch.setattr('cutting_trainer.session.beside_page._Program', program)
+    launched.line('{"ask": "state"}')
+    told = launched.answers[-1]['attempts']
+    assert [each['bag'] for each in told] == ['vessel-3', 'vessel-1']  # type: ignore[index]
+    assert not any('secret' in json.dumps(answer) for answer in launched.answers)
+    launched.line('{"ask": "watch", "bags": ["vessel-2"], "number": 5}')
+    assert 'could not be done' in launched.answers[-1]['problem']
+    launched.line('{"ask": "watch", "bags": ["vessel-3", "vessel-1"], "number": 6}')
+    words = asked[-1]
+    assert words[:5] == ('view', '--bag', '/secret/vessel-3', '--beside', '/secret/vessel-1')
+    with socket.create_server(('127.0.0.1', int(words[words.index('--port') + 1]))):
+        launched.line('')
+    number, link = launched.answers[-1]['replay']
+    assert int(number) == 6 and link.endswith('token=of-this-test')
+
+
+def test_an_attempt_is_recorded_with_its_subject_until_its_score(
+    launched: Launched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refreshed: list[int] = []
+    monkeypatch.setattr(
+        'cutting_trainer.session.view_command.new_bag', lambda *_: tmp_path / 'bags' / 'vessel-1'
+    )
+    monkeypatch.setattr(launched.session._attempts, 'refresh', lambda: refreshed.append(1))
+    launched.line('{"ask": "attempt", "scene": "block", "subject": "p-01"}')  # no exercise
+    assert 'could not be done' in launched.answers[-1]['problem'] and not launched.replaced
+    launched.line('{"ask": "attempt", "scene": "vessel", "subject": "p-01"}')
+    nodes, recorder = launched.replaced
+    assert TISSUE_NODE in {command.name for command in nodes}
+    said = ' '.join(recorder[0].argv)
+    assert 'subject:="p-01"' in said and 'attempt:="1"' in said
+    assert launched.answers[-1]['recording'] == 'vessel-1'
+    launched.line('{"ask": "finish"}')
+    assert launched.answers[-1]['recording'] == '' and refreshed
+    launched.line('{"ask": "record", "on": true}')  # of the operator: it goes on after a score
+    launched.line('{"ask": "finish"}')
+    assert launched.answers[-1]['recording'] == 'vessel-1'

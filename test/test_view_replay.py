@@ -27,7 +27,7 @@ from cutting_trainer.session.node_commands import LOCAL
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.viewer.access_control import link, make_gate
 from cutting_trainer.viewer.bag_timeline import ComputedTissue, RecordedTissue, RecordedTool
-from cutting_trainer.viewer.recording import Recording, computed_beside
+from cutting_trainer.viewer.recording import Recording, computed_beside, recorded_beside
 from cutting_trainer.viewer.replay_page import ReplayPage
 
 pytestmark = pytest.mark.long
@@ -156,6 +156,32 @@ def test_page_goes_where_the_time_line_is_put(page: ReplayPage, bag: Bag) -> Non
             moved = reader.values[name][0][0]
             np.testing.assert_allclose(moved, wanted.positions()[used], atol=1e-6)
     reader.close()
+
+
+def test_two_sessions_stand_side_by_side_and_their_hands_begin_together(
+    bag: Bag, scene: Scene
+) -> None:
+    first, other = (Recording(bag, scene.tool, scene.device, scene.exercise) for _ in range(2))
+    waited = 0.4
+    other.track.contact.times = other.track.contact.times + waited  # a hand that began later
+    beside = recorded_beside(other, first)
+    assert beside.later == pytest.approx(waited)
+    page = ReplayPage(first, beside, LOCAL, 0, GATE)
+    try:
+        reader = OpenPage(url(page))
+        page.seek(0.5 * first.end)
+        reader.wait(
+            lambda: (page.update(time.monotonic()), 'beside' in reader.values)[1], 'both tissues'
+        )
+        moment = reader.values['moment']
+        (further,) = moment['further']
+        apart = np.subtract(further['tip'], moment['tip'])
+        assert apart == pytest.approx([reader.values['hello']['tissues'][1]['offset'][0], 0, 0])
+        assert further['wxyz'] == pytest.approx(moment['wxyz'])
+        assert len(reader.values['hello']['further_tools']) == 1
+        reader.close()
+    finally:
+        page.server.stop()
 
 
 def test_page_plays_at_the_speed_that_was_chosen_and_begins_anew_at_the_end(

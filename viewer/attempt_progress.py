@@ -71,7 +71,7 @@ class AttemptProgress:
         if attempt.over:
             result = score(self._exercise, measures)
             found = {
-                'points': round(result.points),
+                'points': f'{result.points:.1f}',
                 'passed': result.passed,
                 'reasons': result.reasons[:_MAX_REASONS],
             }

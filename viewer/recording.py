@@ -74,10 +74,10 @@ class Recording:
         return float(self.depths[max(at, 0)])
 
     def begin(self) -> float:
-        """Return the time just before the hand begins to move [s]."""
+        """Return the time just before the hand begins to move [s]; it may be before the bag's."""
         tips = self.track.contact.vectors('device')
         left = np.linalg.norm(tips - tips[:1], axis=1) > _LEAVES_M
-        return max(float(self.track.contact.times[left.argmax()]) - _BEFORE_S, 0.0)
+        return float(self.track.contact.times[left.argmax()]) - _BEFORE_S
 
 
 @dataclass(eq=False)
