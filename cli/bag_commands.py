@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import Progress
 from rich.status import Status
 
 from cutting_trainer.cli.bag_errors import reading
@@ -56,6 +57,36 @@ def picture(
     with _working('drawing'), reading(bag):
         make_picture(bag, file, at)
     _tell_written([file], as_json=as_json)
+
+
+@commands.command(epilog=EXIT_STATUSES)
+def film(
+    bag: BagArgument,
+    output: Annotated[
+        Path, typer.Option('--output', '-o', help='File to write: .mp4, .webm or .gif.')
+    ],
+    beside: Annotated[
+        Path | None, typer.Option(help='Folder of another bag, to show beside it.')
+    ] = None,
+    start: Annotated[float, typer.Option(min=0.0, help='Where to begin [s].')] = 0.0,
+    end: Annotated[float | None, typer.Option(min=0.0, help='Where to end [s].')] = None,
+    rate: Annotated[
+        float, typer.Option(min=0.01, max=100.0, help='Seconds of the session in one second.')
+    ] = 1.0,
+    fps: Annotated[int, typer.Option(min=1, max=120, help='Pictures a second.')] = 30,
+    size: Annotated[
+        tuple[int, int], typer.Option(min=64, max=4096, help='Width and height [pixel].')
+    ] = (1280, 720),
+    as_json: AsJson = False,
+) -> None:
+    """Write a recorded session as a moving picture, drawn by the page. Needs Chromium."""
+    from cutting_trainer.recordings.film_command import FilmOptions, make_film
+
+    options = FilmOptions(bag, output, beside, start, end, rate, fps, (size[0] & -2, size[1] & -2))
+    with Progress(console=Console(stderr=True), transient=True) as shown, reading(bag):
+        task = shown.add_task('drawing', total=1.0)
+        make_film(options, lambda share: shown.update(task, completed=share))
+    _tell_written([output], as_json=as_json)
 
 
 @commands.command(epilog=EXIT_STATUSES)

@@ -74,9 +74,7 @@ def view_bag(options: ReplayOptions) -> Status:
             computed = resimulated(bag, scene, notes, changed=bool(options.changes))
             beside = computed_beside(name, computed)
         elif options.beside is not None:
-            folder = Path(temporary) / 'beside'
-            folder.mkdir()
-            other, _ = _recording(open_bag(options.beside), folder)
+            other = open_recording(options.beside, Path(temporary) / 'beside')
             beside = recorded_beside(other, recording)
         page = ReplayPage(recording, beside, host, port, gate)
     with _interrupts() as seen:
@@ -85,6 +83,20 @@ def view_bag(options: ReplayOptions) -> Status:
         page.run(lambda: bool(seen))
     page.server.stop()
     return Status.OK
+
+
+def open_recording(bag: Path, folder: Path) -> Recording:
+    """Return a recorded session.
+
+    Args:
+        bag: folder of the bag.
+        folder: made, for its scene.
+
+    Raises:
+        BagError, SceneError: the bag or its scene is not valid.
+    """
+    folder.mkdir()
+    return _recording(open_bag(bag), folder)[0]
 
 
 def _recording(

@@ -84,6 +84,7 @@ HERE = (
     'picture BAG -o liver.png',
     'picture bags/samples/format_7/crossing_cuts -o crossing_cuts.png',
     'picture BAG',
+    'film BAG -o cut.mp4',
     'report BAG -o report.html',
     'resimulate BAG',
     'resimulate BAG --with tissue.material.toughness=40',

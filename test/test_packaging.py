@@ -23,6 +23,7 @@ ROOMS = tuple(
     sorted(path.name for path in (ROOT / 'cutting_trainer').iterdir() if path.is_symlink())
 )
 PUBLISHED_AS = {
+    'PIL': 'pillow',
     '_pytest': 'pytest',
     'mpl_toolkits': 'matplotlib',
     'pydantic_core': 'pydantic',
@@ -123,10 +124,12 @@ def imported_by(folder: str) -> set[str]:
 @pytest.mark.parametrize('room', ROOMS)
 def test_every_library_that_a_room_imports_is_pinned_for_run_time(room: str) -> None:
     # the mesher is an extra: it has no wheels for every machine
-    # and Dask is installed before the first study
-    extra = {'mesh_import': {'pytetwild'}, 'studies': {'dask', 'distributed', 'tornado'}}.get(
-        room, set()
-    )
+    # and Dask and the encoders of films are installed before their first use
+    extra = {
+        'mesh_import': {'pytetwild'},
+        'studies': {'dask', 'distributed', 'tornado'},
+        'recordings': {'av', 'pillow'},
+    }.get(room, set())
     assert imported_by(room) <= pins('requirements.txt').keys() | extra
 
 

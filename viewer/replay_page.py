@@ -45,6 +45,9 @@ class ReplayPage:
         host, port: address of the page.
         gate: access rules.
 
+    Attributes:
+        end: of the session, or of both [s].
+
     Raises:
         PageError: the page cannot be served at this address.
     """
@@ -54,13 +57,13 @@ class ReplayPage:
     ) -> None:
         self._recording, self._beside = recording, beside
         self._sources = TissueSource(RECORDED), TissueSource(BESIDE)
-        self._end = max(recording.end, beside.end if beside else 0.0)
-        self._playhead = Playhead(0.0, self._end)
+        self.end = max(recording.end, beside.end if beside else 0.0)
+        self._playhead = Playhead(0.0, self.end)
         positions = recording.tissue.go_to(0.0).positions()
         self._apart = np.array([TISSUE_SPACING * float(np.ptp(positions[:, 0])), 0.0, 0.0])
         self._shown = -1.0
         self._asked = Requests()
-        controls = ReplayControls(self._end, SPEEDS)
+        controls = ReplayControls(self.end, SPEEDS)
         self.server = PageServer(host, port, gate, 'replay', controls, self._ask)
         self._hello(positions)
         self._plot()
@@ -85,7 +88,7 @@ class ReplayPage:
             scenes=[],
             methods=[],
             exercises=[],
-            duration=self._end,
+            duration=self.end,
             speeds=SPEEDS,
             tool=tool_shape(recording.tool),
             further_tools=tools,
@@ -94,14 +97,14 @@ class ReplayPage:
             bounds=None,
             metres_per_newton=METRES_PER_NEWTON,
             tissues=[shown_tissue(RECORDED, named), *tissues],
-            plots_span=self._end,
+            plots_span=self.end,
             exercise=shown_exercise(recording.exercise),
         )
 
     def _plot(self) -> None:
         recording, beside = self._recording, self._beside
         wrench = recording.track.wrench
-        times = np.linspace(0.0, self._end, _PLOT_POINTS)
+        times = np.linspace(0.0, self.end, _PLOT_POINTS)
         hand = np.linalg.norm(wrench.vectors('force'), axis=1)
         colours = {'recorded': BLUE}
         felt = [resampled(times, *recording.felt)]
@@ -115,7 +118,7 @@ class ReplayPage:
             Plot('Force of the tissue', 'N', colours, 0.5).lines(times, *felt),
             DEPTH.lines(times, resampled(times, recording.track.contact.times, depths)),
         )
-        self.server.put('plots', span=[0.0, self._end], lines=lines)
+        self.server.put('plots', span=[0.0, self.end], lines=lines)
 
     def _ask(self, message: AnyMessage) -> None:
         """Queue a request of a page, in the server's thread; the next update executes it."""

@@ -1,92 +1,32 @@
-"""A headless Chromium, driven by its DevTools protocol in the role of a person.
+"""A headless Chromium in the role of a person."""
 
-Pictures are drawn by software, so that no graphics card is needed.
-"""
-
-import base64
 import io
-import itertools
 import json
-import os
-import shutil
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from urllib.request import Request, urlopen
 
 import numpy as np
 from matplotlib import image
-from websockets.sync.client import connect
 
 from bench.common.waiting import until
-from cutting_trainer.session import parent_death_signal
-
-STEP_TIMEOUT_S = 150.0
-"""Timeout of any step on a shared machine without a graphics card."""
-_NAMES = ('chromium', 'chromium-browser', 'google-chrome')
-CHROMIUM = next(filter(None, map(shutil.which, _NAMES)), None)
+from cutting_trainer.recordings import headless_browser
+from cutting_trainer.recordings.headless_browser import CHROMIUM as CHROMIUM
+from cutting_trainer.recordings.headless_browser import STEP_TIMEOUT_S, run_browser
 
 
-class Page:
-    """One page that is open in the browser.
-
-    Args:
-        address: of its DevTools socket.
-        coarseness: pixels of the page for one that is drawn, along each side.
-    """
-
-    def __init__(self, address: str, coarseness: int = 1) -> None:
-        self._coarseness = coarseness
-        self._socket = connect(address, max_size=None)
-        self._numbers = itertools.count(1)
-        self.requests: list[str] = []
-        self.call('Page.enable')
-        self.call('Network.enable')
-
-    def call(self, method: str, **parameters: Any) -> Any:
-        """Call a method of the protocol and return its result."""
-        number = next(self._numbers)
-        self._socket.send(json.dumps({'id': number, 'method': method, 'params': parameters}))
-        while True:
-            message = json.loads(self._socket.recv(STEP_TIMEOUT_S))
-            if message.get('method') == 'Network.requestWillBeSent':
-                self.requests.append(message['params']['request']['url'])
-            if message.get('id') == number:
-                assert 'error' not in message, message
-                return message['result']
-
-    def resize(self, width: int, height: int) -> None:
-        """Give the page another size [pixel]."""
-        self.call(
-            'Emulation.setDeviceMetricsOverride',
-            width=width,
-            height=height,
-            deviceScaleFactor=1 / self._coarseness,
-            mobile=False,
-        )
-
-    def open(self, url: str) -> None:
-        """Go to a page."""
-        self.call('Page.navigate', url=url)
+class Page(headless_browser.Page):
+    """One page that a person looks at and operates."""
 
     def reload(self) -> None:
         """Load the page again, without a copy of the old one in the back."""
         self.call('Page.reload')
 
-    def evaluate(self, script: str) -> Any:
-        """Return the value of an expression in the page."""
-        done = self.call('Runtime.evaluate', expression=script, returnByValue=True)
-        return done['result'].get('value')
-
     def picture(self) -> np.ndarray:
         """Return a screenshot, shape (height, width, 3), 0 to 255."""
-        data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
-        drawn = np.rint(255 * image.imread(io.BytesIO(data))[..., :3]).astype(np.uint8)
+        drawn = np.rint(255 * image.imread(io.BytesIO(self.screenshot()))[..., :3]).astype(np.uint8)
         return drawn.repeat(self._coarseness, axis=0).repeat(self._coarseness, axis=1)
 
     def save(self, file: Path) -> None:
@@ -172,74 +112,12 @@ class Page:
         """Wait for a condition, and return its value."""
         return until(condition, goal, timeout, 0.1)
 
-    def close(self) -> None:
-        """Leave the page to the browser."""
-        self._socket.close()
 
-
-class Browser:
-    """A browser that runs.
-
-    Args:
-        port: of the DevTools.
-        size: of its pages [pixel].
-        coarseness: pixels of the page for one that is drawn, along each side.
-        process: number of its first process.
-    """
-
-    def __init__(self, port: int, size: tuple[int, int], coarseness: int, process: int) -> None:
-        self._port, self._size, self._coarseness = port, size, coarseness
-        self.process = process
-        self.pages: list[Page] = []
-
-    def page(self, url: str = 'about:blank') -> Page:
-        """Open one more page."""
-        request = Request(f'http://127.0.0.1:{self._port}/json/new?about:blank', method='PUT')
-        with urlopen(request) as answer:
-            page = Page(json.load(answer)['webSocketDebuggerUrl'], self._coarseness)
-        page.resize(*self._size)
-        page.open(url)
-        self.pages.append(page)
-        return page
+Browser = headless_browser.Browser[Page]
 
 
 @contextmanager
 def chromium(size: tuple[int, int], coarseness: int = 1) -> Iterator[Browser]:
-    """Run a browser with a temporary profile that reaches this machine only.
-
-    Args:
-        size: of its pages [pixel].
-        coarseness: pixels of a page for one that is drawn: software draws slowly.
-    """
-    assert CHROMIUM is not None
-    with tempfile.TemporaryDirectory(prefix='chromium-', ignore_cleanup_errors=True) as profile:
-        # Bound to this process: the kernel ends both together.
-        command = [sys.executable, '-I', '-S', parent_death_signal.__file__, str(os.getpid()), '9']
-        command += [CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
-        command += [f'--user-data-dir={profile}', '--no-first-run', '--disable-extensions']
-        command += ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--mute-audio']
-        command += ['--disable-background-networking', '--disable-dev-shm-usage']
-        command += ['--disable-features=BackForwardCache']
-        command += ['--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1']
-        with Path(profile, 'said').open('wb') as said:
-            process = subprocess.Popen(
-                command,
-                stdout=said,
-                stderr=said,
-                start_new_session=True,
-            )
-        try:
-            file = Path(profile, 'DevToolsActivePort')
-            deadline = time.monotonic() + STEP_TIMEOUT_S
-            while not (file.exists() and file.read_text().count('\n')):
-                assert process.poll() is None, Path(profile, 'said').read_text()
-                assert time.monotonic() < deadline, 'chromium does not start'
-                time.sleep(0.05)
-            port = int(file.read_text().splitlines()[0])
-            browser = Browser(port, size, coarseness, process.pid)
-            yield browser
-            for page in browser.pages:
-                page.close()
-        finally:
-            os.killpg(process.pid, 9)
-            process.wait()
+    """Run a browser; see `run_browser`."""
+    with run_browser(Page, size, coarseness) as browser:
+        yield browser

@@ -1,0 +1,63 @@
+"""Claims about films of recorded sessions: foreign decoders read what the page has drawn."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from cutting_trainer.recordings.film_command import FilmOptions, make_film, picture_times
+from cutting_trainer.recordings.headless_browser import CHROMIUM
+from cutting_trainer.session.errors import SessionError
+
+pytestmark = pytest.mark.long
+
+SAMPLE = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_7' / 'straight_cut'
+SIZE = 320, 200
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None, reason='chromium is not installed: sudo apt install chromium'
+)
+
+
+def film(file: Path, start: float, end: float) -> tuple[int, list[float]]:
+    shares: list[float] = []
+    options = FilmOptions(SAMPLE, file, start=start, end=end, fps=5, size=SIZE)
+    return make_film(options, shares.append), shares
+
+
+@needs_browser
+def test_a_film_has_the_pictures_of_its_times_and_the_tissue_is_opened_in_it(
+    tmp_path: Path,
+) -> None:
+    count, shares = film(tmp_path / 'cut.mp4', 0.0, 6.0)
+    assert count == 31 and shares[-1] == 1.0
+    with av.open(str(tmp_path / 'cut.mp4')) as container:
+        pictures = [frame.to_ndarray(format='rgb24') for frame in container.decode(video=0)]
+        assert float(container.duration / av.time_base) == pytest.approx(count / 5, abs=0.05)
+    assert len(pictures) == count and pictures[0].shape == (*SIZE[::-1], 3)
+    assert [path.name for path in tmp_path.iterdir()] == ['cut.mp4']
+    red = [int(((p[..., 0] > 120) & (p[..., 0] > p[..., 2] + 40)).sum()) for p in pictures]
+    assert min(red) > 100, 'tissue is in every picture'
+    moving = [np.abs(np.subtract(a, b, dtype=float)).mean() for a, b in pairwise(pictures)]
+    assert max(moving) > 0.1, 'something moves'
+
+
+@needs_browser
+def test_a_gif_runs_as_long_as_the_session(tmp_path: Path) -> None:
+    count, _ = film(tmp_path / 'cut.gif', 2.0, 3.0)
+    with Image.open(tmp_path / 'cut.gif') as made:
+        assert made.n_frames == count == 6
+        assert made.info['duration'] == 200 and made.size == SIZE
+
+
+def test_what_cannot_be_filmed_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=r'end its name in \.mp4, \.webm, \.gif'):
+        film(tmp_path / 'cut.avi', 0.0, 1.0)
+    options = FilmOptions(SAMPLE, tmp_path / 'cut.mp4', start=9.0)
+    with pytest.raises(SessionError, match=r'--start 9 .* of 7\.0 s make 0 pictures'):
+        picture_times(options, 7.0)
+    slow = FilmOptions(SAMPLE, tmp_path / 'cut.mp4', rate=0.01, fps=120)
+    with pytest.raises(SessionError, match='36000 can be'):
+        picture_times(slow, 7.0)
