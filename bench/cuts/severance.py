@@ -346,7 +346,7 @@ def main() -> None:
     parser.add_argument('--curves', type=int, default=20, help='random curves of each shape')
     parser.add_argument('--shapes', nargs='*', default=['circle', 'four arcs', 'four lines'])
     parser.add_argument('--fuzz', type=int, default=0, help='random curves in the first mesh only')
-    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--seed', type=int, default=0, help='of the first stroke')
     parser.add_argument('--kept', type=Path, default=Path('severance.jsonl'), help='of the fuzz')
     options = parser.parse_args()
     makers = {'slab': slab, 'liver': liver, 'scattered': scattered}
@@ -360,13 +360,16 @@ def main() -> None:
         for name in options.shapes:
             for ratio in ratios:
                 cuts = [
-                    PLUGS[name](organ, ratio, np.random.default_rng(k)) for k in range(options.runs)
+                    PLUGS[name](organ, ratio, np.random.default_rng(options.seed + k))
+                    for k in range(options.runs)
                 ]
                 runs = [measure(organ, cut, options.method) for cut in cuts]
                 _row(f'{organ.name}, {name}, {ratio} h', runs)
         for shape in SHAPES if options.curves else ():
             for through in (True, False):
-                rngs = [np.random.default_rng(1000 + k) for k in range(options.curves)]
+                rngs = [
+                    np.random.default_rng(1000 + options.seed + k) for k in range(options.curves)
+                ]
                 cuts = [curved(organ, shape, rng, through=through) for rng in rngs]
                 runs = [measure(organ, cut, options.method) for cut in cuts]
                 _row(f'{organ.name}, {shape}, {"through" if through else "partial"}', runs)
