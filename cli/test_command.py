@@ -66,10 +66,9 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
         Check('ruff format', (*python, 'ruff', 'format', '--check', '.')),
         Check('mypy', (*python, 'mypy')),
     ]
-    in_order = ('--dist=loadfile', '--no-loadscope-reorder')
     for name, part, more, repetitions in (
         (TESTS, 'beside', ('--numprocesses=auto', '--dist=loadfile'), 0),
-        (LIVE, 'live', ('--numprocesses=2', *in_order), MAX_REPETITIONS),
+        (LIVE, 'live', ('--numprocesses=2', '--dist=loadfile'), MAX_REPETITIONS),
         (ALONE, 'alone', (), MAX_REPETITIONS),
     ):
         which = (f'--tier={tier}', f'--part={part}', '--last-failed-no-failures=none')

@@ -7,8 +7,7 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE
 from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, StampedMessage
-from cutting_trainer.node_common.rejections import MessageError
-from cutting_trainer.node_common.scene_reader import MAX_TOOLS
+from cutting_trainer.node_common.rejections import MAX_TOOLS, MessageError
 from cutting_trainer.tissue_sim.mesh.replica import MAX_COORDINATE
 
 MAX_FORCE_N = 1e3

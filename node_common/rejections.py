@@ -2,8 +2,6 @@
 
 from collections import Counter
 
-from cutting_trainer.node_common.scene_reader import MAX_TOOLS
-
 MAX_REASONS = 64
 """Pairs of topic and reason that are counted separately; further pairs count as `OTHER_REASONS`."""
 MAX_LOGGED_REASONS = 4
@@ -15,6 +13,8 @@ MAX_DETAIL_LENGTH, MAX_QUOTED_LENGTH = 300, 60
 hundred megabytes, and reasons go to the log, /diagnostics and operating states."""
 OTHER_REASONS = 'others'
 TISSUE_FRAME = 'tissue'
+MAX_TOOLS = 4
+"""Largest number of tools in a scene. Messages name theirs by its place in the list, from 0."""
 
 
 class MessageError(ValueError):

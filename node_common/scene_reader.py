@@ -27,6 +27,7 @@ from cutting_trainer.node_common.error_place import (
     shortened,
 )
 from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.node_common.rejections import MAX_TOOLS
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError, check_events, read_bounded
 
 SECTIONS = ('tissue', 'tool', 'device', 'haptics', 'cutting', 'arm', 'session', 'exercise')
@@ -35,8 +36,6 @@ TOOLS = 'tools'
 each replace those of the sections of the first tool."""
 OF_A_TOOL = ('tool', 'device', 'haptics', 'arm')
 """Sections that a further tool may change."""
-MAX_TOOLS = 4
-"""Largest number of tools in a scene. Messages name theirs by its place in the list, from 0."""
 _TOOL_NAME = re.compile(r'[a-z][a-z0-9_]{0,31}')
 _TAKEN = (
     *('tissue', 'tool', 'arm', 'cutting', 'viewer', 'recorder', 'replay', 'diagnostics'),

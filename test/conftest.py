@@ -84,12 +84,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Choose tier and part; put those that look at what all others have made behind them.
-
-    The longest file of the live ones comes first: the others fill the time beside it.
-    """
-    last, first = 'test_every_bag.py', 'test_two_tools_live.py'
-    items.sort(key=lambda item: (item.path.name == last, item.path.name != first))
+    """Choose tier and part; put those that look at what all others have made behind them."""
+    items.sort(key=lambda item: item.path.name == 'test_every_bag.py')
     left_out = LEFT_OUT[config.getoption('tier')]
     part = config.getoption('part')
     chosen, others = [], []

@@ -42,7 +42,7 @@ from cutting_trainer.session.node_commands import MODULES
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.tool import ContactState
 
-pytestmark = pytest.mark.live
+pytestmark = pytest.mark.real_time
 
 SECONDS = 9.0
 OTHER = (0.012, 0.008)
