@@ -20,6 +20,8 @@ POSE_FAULTS = {
     JUMP: 'the device jumped: faster than 10 m/s between two poses',
     ROTATION_JUMP: 'the device jumped: it turned faster than 60 rad/s between two poses',
 }
+MIN_FORCE_N = 1e-150
+"""[N]. The square of a smaller number underflows, so its norm is not known."""
 MAX_DEVICE_DISTANCE_M = 10.0
 """[m] from the origin of the device frame. Millimetres sent as metres exceed it at once."""
 MAX_DEVICE_SPEED_M_S = 10.0
@@ -171,9 +173,15 @@ def limit_slew(last: np.ndarray, largest: float, force: np.ndarray) -> None:
 
 @inner
 def clamp(ceiling: float, force: np.ndarray) -> None:
-    """Limit the norm to `ceiling` [N], direction kept. Force [N], shape (3,), changed in place."""
+    """Limit the norm to `ceiling` [N], direction kept. Force [N], shape (3,), changed in place.
+
+    A force below `MIN_FORCE_N` becomes zero.
+    """
     size = norm(force)
-    if size > ceiling:
+    if size < MIN_FORCE_N:
+        for k in range(3):
+            force[k] *= 0.0
+    elif size > ceiling:
         for k in range(3):
             force[k] *= ceiling / size
 

@@ -9,8 +9,9 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import DEFAULT_STIFFNESS_N_M, Stiffness
+from cutting_trainer.node_common.error_place import nearest
 from cutting_trainer.node_common.orientation import from_rpy
-from cutting_trainer.node_common.scene_reader import SceneModel, bounded_yaml, nearest, syntax_error
+from cutting_trainer.node_common.scene_reader import SceneModel, bounded_yaml, syntax_error
 from cutting_trainer.node_common.share_folder import share_folder
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError
 from cutting_trainer.tissue_sim.contact.tool import MIN_RADIUS_M

@@ -5,24 +5,27 @@ derived from `SceneModel` and reads it with `read_section`. YAML 1.2 applies: `1
 `yes` and `on` are words.
 """
 
-import difflib
 import functools
 import json
 import re
-import types
-import typing
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
-from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from cutting_trainer.node_common.error_place import (
+    SectionPlace,
+    child_of,
+    dotted,
+    kind_of,
+    line_of,
+    most_helpful,
+    nearest,
+    shortened,
+)
 from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.node_common.rejections import MAX_TOOLS
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError, check_events, read_bounded
@@ -92,8 +95,8 @@ def read_section(path: Path, section: str, model: type[M], tool: str = '') -> M:
     except ValidationError as error:
         if content is None:
             raise SceneError(_missing_section(path, section, error)) from None
-        place = _Place(path, section, _child(root, section) or root, model)
-        raise SceneError(_most_helpful(place, error.errors())) from None
+        place = SectionPlace(path, section, child_of(root, section) or root, model)
+        raise SceneError(most_helpful(place, error.errors())) from None
 
 
 def read_document(path: Path, model: type[M], kind: str) -> M:
@@ -115,7 +118,9 @@ def read_document(path: Path, model: type[M], kind: str) -> M:
             context={'folder': path.parent.resolve()},
         )
     except ValidationError as error:
-        raise SceneError(_most_helpful(_Place(path, '', root, model), error.errors())) from None
+        raise SceneError(
+            most_helpful(SectionPlace(path, '', root, model), error.errors())
+        ) from None
 
 
 def tool_names(path: Path) -> tuple[str, ...]:
@@ -125,7 +130,7 @@ def tool_names(path: Path) -> tuple[str, ...]:
         SceneError: one sentence with file, line, key, value and remedy.
     """
     root, _ = _read(path)
-    return tuple(str(key.value) for key, _ in _pairs(_child(root, TOOLS)))
+    return tuple(str(key.value) for key, _ in _pairs(child_of(root, TOOLS)))
 
 
 def _as_of_tool(
@@ -136,12 +141,12 @@ def _as_of_tool(
     if tool not in names:
         known = ', '.join(names) or 'none'
         raise SceneError(f'{path}: section {TOOLS} has no {tool!r:.60}: known are {known}')
-    own = _child(root, TOOLS)
-    changes = None if own is None else _child(own, tool)
-    pairs = _pairs(None if changes is None else _child(changes, section))
+    own = child_of(root, TOOLS)
+    changes = None if own is None else child_of(own, tool)
+    pairs = _pairs(None if changes is None else child_of(changes, section))
     if not pairs:
         return root, document
-    before = _child(root, section)
+    before = child_of(root, section)
     changed = {str(key.value) for key, _ in pairs}
     kept = [(k, v) for k, v in _pairs(before) if str(k.value) not in changed]
     made = MappingNode('tag:yaml.org,2002:map', [*kept, *pairs], pairs[0][0].start_mark)
@@ -165,12 +170,6 @@ def missing_file(path: Path) -> str:
     alike = (e.name for e in path.parent.iterdir() if e.suffix == path.suffix and e.is_file())
     near = nearest(path.name, alike)
     return f'{path} does not exist: ' + (f'did you mean {near}?' if near else 'check the path')
-
-
-def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word most similar to a misspelt one, or None."""
-    matches = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return matches[0] if matches else None
 
 
 def _read(
@@ -204,7 +203,7 @@ def _parsed(
     if root is None:
         raise SceneError(f'{path} is empty: {expected}')
     if not isinstance(root, MappingNode):
-        raise SceneError(f'{path}:{_line(root)}: the file is a {_kind(root)}: {expected}')
+        raise SceneError(f'{path}:{line_of(root)}: the file is a {kind_of(root)}: {expected}')
     document = _plain(root, path, ())
     if kind == 'scene':
         _check_sections(root, path)
@@ -251,7 +250,7 @@ def _plain(node: Node, path: Path, keys: tuple[str, ...], above: tuple[Node, ...
 
     Values that would be lost or ambiguous are refused.
     """
-    where = f'{path}:{_line(node)}: {_dotted(keys) or "the file"}'
+    where = f'{path}:{line_of(node)}: {dotted(keys) or "the file"}'
     if any(node is parent for parent in above):
         raise SceneError(f'{where} contains itself by an alias: write the values out')
     above = (*above, node)
@@ -261,16 +260,16 @@ def _plain(node: Node, path: Path, keys: tuple[str, ...], above: tuple[Node, ...
         for key_node, value_node in node.value:
             if not isinstance(key_node, ScalarNode):
                 raise SceneError(
-                    f'{path}:{_line(key_node)}: a key is a {_kind(key_node)}: keys are words'
+                    f'{path}:{line_of(key_node)}: a key is a {kind_of(key_node)}: keys are words'
                 )
             key = str(key_node.value)
             if key in values:
                 raise SceneError(
-                    f'{path}:{_line(key_node)}: {_dotted((*keys, key))} is given twice, first in '
+                    f'{path}:{line_of(key_node)}: {dotted((*keys, key))} is given twice, first in '
                     f'line {lines[key]}: delete one of them'
                 )
             values[key] = _plain(value_node, path, (*keys, key), above)
-            lines[key] = _line(key_node)
+            lines[key] = line_of(key_node)
         return values
     if isinstance(node, SequenceNode):
         return [_plain(n, path, (*keys, str(i)), above) for i, n in enumerate(node.value)]
@@ -278,8 +277,8 @@ def _plain(node: Node, path: Path, keys: tuple[str, ...], above: tuple[Node, ...
         return YAML(typ='safe', pure=True).constructor.construct_object(node)
     except (YAMLError, ValueError):
         raise SceneError(
-            f'{where}: {_short(node.value)} with the tag {node.tag} cannot be read: write a plain '
-            'number or word without a tag'
+            f'{where}: {shortened(node.value)} with the tag {node.tag} cannot be read: '
+            'write a plain number or word without a tag'
         ) from None
 
 
@@ -289,11 +288,11 @@ def _check_sections(root: MappingNode, path: Path) -> None:
         if section not in known:
             near = nearest(section, known)
             hint = f'did you mean {near}?' if near else f'known are {", ".join(known)}'
-            raise SceneError(f'{path}:{_line(key_node)}: {section} is not a section: {hint}')
+            raise SceneError(f'{path}:{line_of(key_node)}: {section} is not a section: {hint}')
         if not _is_empty(value_node) and not isinstance(value_node, MappingNode):
             raise SceneError(
-                f'{path}:{_line(value_node)}: section {section} is a {_kind(value_node)}: it must '
-                'be a mapping of keys to values'
+                f'{path}:{line_of(value_node)}: section {section} is a {kind_of(value_node)}: '
+                'it must be a mapping of keys to values'
             )
         if section == TOOLS:
             _check_tools(value_node, path)
@@ -304,33 +303,33 @@ def _check_tools(node: Node, path: Path) -> None:
     tools = _pairs(node)
     if len(tools) >= MAX_TOOLS:
         raise SceneError(
-            f'{path}:{_line(node)}: {TOOLS} has {len(tools)} further tools: at most '
+            f'{path}:{line_of(node)}: {TOOLS} has {len(tools)} further tools: at most '
             f'{MAX_TOOLS - 1} fit beside the first'
         )
     for name_node, content in tools:
-        name, where = str(name_node.value), f'{path}:{_line(name_node)}: {TOOLS}'
+        name, where = str(name_node.value), f'{path}:{line_of(name_node)}: {TOOLS}'
         if not _TOOL_NAME.fullmatch(name):
             raise SceneError(
-                f'{where} has {_short(name)}: a tool is named by a ROS namespace, such as grasper: '
-                'lower-case letters, digits and underscores'
+                f'{where} has {shortened(name)}: a tool is named by a ROS namespace, '
+                'such as grasper: lower-case letters, digits and underscores'
             )
         if name in _TAKEN:
             raise SceneError(f'{where}.{name}: a topic or node has this name: choose another')
         if not isinstance(content, MappingNode) and not _is_empty(content):
             raise SceneError(
-                f'{where}.{name} is a {_kind(content)}: it must be a mapping of the sections '
+                f'{where}.{name} is a {kind_of(content)}: it must be a mapping of the sections '
                 f'{", ".join(OF_A_TOOL)}'
             )
         for key, value in _pairs(content):
             section = str(key.value)
-            where = f'{path}:{_line(key)}: {TOOLS}.{name}.{section}'
+            where = f'{path}:{line_of(key)}: {TOOLS}.{name}.{section}'
             if section not in OF_A_TOOL:
                 near = nearest(section, OF_A_TOOL)
                 hint = f'did you mean {near}?' if near else f'known are {", ".join(OF_A_TOOL)}'
                 raise SceneError(f'{where} is not a section of a tool: {hint}')
             if not isinstance(value, MappingNode) and not _is_empty(value):
                 raise SceneError(
-                    f'{where} is a {_kind(value)}: it must be a mapping of keys to values'
+                    f'{where} is a {kind_of(value)}: it must be a mapping of keys to values'
                 )
 
 
@@ -339,120 +338,5 @@ def _is_empty(node: Node) -> bool:
 
 
 def _missing_section(path: Path, section: str, error: ValidationError) -> str:
-    needed = ', '.join(_dotted(e['loc']) for e in error.errors() if e['type'] == 'missing')
+    needed = ', '.join(dotted(e['loc']) for e in error.errors() if e['type'] == 'missing')
     return f'{path}: section {section} is missing' + (f': it needs {needed}' if needed else '')
-
-
-@dataclass(frozen=True)
-class _Place:
-    """One section of one file; turns the errors of its model into sentences."""
-
-    path: Path
-    section: str
-    node: Node
-    model: type[BaseModel]
-
-    def locate(self, loc: tuple[int | str, ...]) -> tuple[int, tuple[str, ...]]:
-        """Return line and key path of an error.
-
-        Parts of `loc` that name a model are skipped.
-        """
-        node, line, keys = self.node, _line(self.node), [self.section] if self.section else []
-        for part in loc:
-            found = _key_and_value(node, part)
-            if found is not None:
-                line, node = _line(found[0]), found[1]
-                keys.append(str(part))
-        return line, tuple(keys)
-
-    def sentence(self, error: ErrorDetails) -> str:
-        line, keys = self.locate(error['loc'])
-        models, field = _described(self.model, error['loc'])
-        about = f' ({field.description})' if field is not None and field.description else ''
-        head = f'{self.path}:{line}: {_dotted(keys) or "the file"}'
-        if error['type'] == 'missing':
-            return f'{head} is {_short(error["input"])}: {error["loc"][-1]} is missing{about}'
-        if error['type'] == 'extra_forbidden':
-            known = list(dict.fromkeys(name for m in models for name in m.model_fields))
-            near = nearest(keys[-1], known)
-            hint = f'did you mean {near}?' if near else f'known are {", ".join(known)}'
-            return f'{head} is not a key here: {hint}'
-        if error['type'] in ('value_error', 'assertion_error'):
-            return f'{head}: {error["ctx"]["error"]}'
-        reason = error['msg'][:1].lower() + error['msg'][1:]
-        return f'{head} is {_short(error["input"])}: {reason}{about}'
-
-
-def _most_helpful(place: _Place, errors: list[ErrorDetails]) -> str:
-    """Return the first error; unknown keys come before other errors, parts before their whole.
-
-    An unknown key often explains a missing one, and a bad item a list that is too short.
-    """
-
-    def rank(error: ErrorDetails) -> tuple[bool, bool, int]:
-        loc = error['loc']
-        whole = any(other['loc'][: len(loc)] == loc != other['loc'] for other in errors)
-        return error['type'] != 'extra_forbidden', whole, place.locate(loc)[0]
-
-    return place.sentence(min(errors, key=rank))
-
-
-def _described(
-    model: type[BaseModel], loc: tuple[int | str, ...]
-) -> tuple[list[type[BaseModel]], FieldInfo | None]:
-    """Return the models that have the last part of `loc` as a key, and its field or the last
-    known.
-    """
-    models, field = [model], None
-    for i, part in enumerate(loc):
-        fields = [m.model_fields[part] for m in models if part in m.model_fields]
-        if not fields:
-            narrowed = [m for m in models if m.__name__ == part]
-            models = narrowed or models
-            continue
-        field = fields[0]
-        inner = [m for f in fields for m in models_in(f.annotation)]
-        if i + 1 < len(loc):
-            models = inner or models
-    return models, field
-
-
-def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models within the type of a field."""
-    if isinstance(annotation, types.GenericAlias) or typing.get_origin(annotation) is not None:
-        for argument in typing.get_args(annotation):
-            yield from models_in(argument)
-    elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-
-
-def _key_and_value(node: Node, part: int | str) -> tuple[Node, Node] | None:
-    if isinstance(node, MappingNode):
-        return next(((k, v) for k, v in node.value if str(k.value) == str(part)), None)
-    if isinstance(node, SequenceNode) and isinstance(part, int) and part < len(node.value):
-        return node.value[part], node.value[part]
-    return None
-
-
-def _child(node: Node, key: str) -> Node | None:
-    found = _key_and_value(node, key)
-    return found[1] if found else None
-
-
-def _line(node: Node) -> int:
-    return int(node.start_mark.line) + 1
-
-
-def _kind(node: Node) -> str:
-    if isinstance(node, MappingNode):
-        return 'mapping'
-    return 'list' if isinstance(node, SequenceNode) else 'single value'
-
-
-def _dotted(keys: Iterable[int | str]) -> str:
-    return '.'.join(str(key) for key in keys)
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, default=str) if not isinstance(value, str) else repr(value)
-    return text if len(text) <= 60 else text[:57] + '...'

@@ -16,7 +16,8 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     ToolSettings,
     check_together,
 )
-from cutting_trainer.node_common.scene_reader import SceneModel, nearest, read_section, tool_names
+from cutting_trainer.node_common.error_place import nearest
+from cutting_trainer.node_common.scene_reader import SceneModel, read_section, tool_names
 from cutting_trainer.node_common.share_folder import share_folder
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings

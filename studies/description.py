@@ -7,11 +7,10 @@ from pydantic import AfterValidator, BaseModel, Field, JsonValue, model_validato
 
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.node_common.error_place import models_in, nearest
 from cutting_trainer.node_common.scene_reader import (
     SECTIONS,
     SceneModel,
-    models_in,
-    nearest,
     read_document,
 )
 from cutting_trainer.studies.outputs import OUTPUTS

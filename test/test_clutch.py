@@ -35,6 +35,7 @@ class Hand:
         self.poses = []
         self.frame = frame
         self.place, self.turn = np.array([0.0, 0.0, RADIUS + 1e-3]), Rotation.identity()
+        self._turned: tuple[Rotation | None, np.ndarray] = None, np.empty(4)
         self.work = 0.0
         self.felt, self.tips, self.blades, self.at = [], [], [], None
 
@@ -45,16 +46,19 @@ class Hand:
         way = (turn * began.inv()).as_rotvec()
         for share in np.arange(1, ms + 1) / ms:
             self.place = start + share * (np.asarray(place) - start)
-            self.turn = Rotation.from_rotvec(share * way) * began
+            if way.any():
+                self.turn = Rotation.from_rotvec(share * way) * began
             self.tick()
 
     def tick(self):
         position = self.frame.to_device(self.place)
-        rotation = self.frame.rotation().T @ self.turn.as_matrix()
         if self.at is not None:
             self.work += self.rig.forces[-1] @ (position - self.at)
         self.at = position
-        quaternion = Rotation.from_matrix(rotation).as_quat()
+        if self.turn is not self._turned[0]:
+            rotation = self.frame.rotation().T @ self.turn.as_matrix()
+            self._turned = self.turn, Rotation.from_matrix(rotation).as_quat()
+        quaternion = self._turned[1]
         self.rig.tick(tuple(position), quaternion)
         self.poses.append(StampedMessage(self.rig.now, '', (*position, *quaternion)))
         self.felt.append(np.linalg.norm(self.rig.forces[-1]))

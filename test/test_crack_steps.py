@@ -10,7 +10,14 @@ pytestmark = pytest.mark.long
 STEADY = SLICED * DEPTH
 
 
-@pytest.mark.parametrize(('cell', 'rate'), [(0.004, 20.0), (0.004, 60.0), (0.0045, 30.0)])
+@pytest.mark.parametrize(
+    ('cell', 'rate'),
+    [
+        (0.004, 20.0),
+        (0.0045, 30.0),
+        pytest.param(0.004, 60.0, marks=pytest.mark.thorough),
+    ],
+)
 def test_the_teeth_are_as_long_as_the_steps_and_cost_what_a_steady_cut_does(cell, rate) -> None:
     found = teeth(cell, rate)
     assert found.length == pytest.approx(CRACK, rel=0.1)

@@ -15,7 +15,9 @@ from cutting_trainer.bags.topic_names import further_tools
 from cutting_trainer.haptic_bridge import e_stop_topic
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings
 from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.operating_state import OperatingStateMachine
+from cutting_trainer.node_common.ros import FORCE, FRAME_INPUTS
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.recordings import resimulate_command
 from cutting_trainer.session.e_stop_latch import PRESSED, RELEASED, EStopState
@@ -26,6 +28,7 @@ from cutting_trainer.session.node_commands import (
     simulation_nodes,
 )
 from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.tissue_sim.streaming.tool_topics import ToolTopics
 
 SCENE = """\
 tool: {radius: 0.004, coupling_stiffness: 300}
@@ -194,3 +197,17 @@ def test_what_a_bag_lacks_is_in_the_json(
     bag: Any = SimpleNamespace(custom_data={})
     resimulate_command._verify(bag, cast('Any', None), as_json=True)
     assert json.loads(capsys.readouterr().out)['missing'] == {'poses of the device': 2}
+
+
+@pytest.mark.parametrize(('inputs', 'forces'), [(1, 0), (0, 1), (1, 1)])
+def test_a_tool_is_recorded_once_inputs_and_forces_have_a_listener(
+    inputs: int, forces: int
+) -> None:
+    """Both are made before the tissue is set up; a recorder may find one before the other."""
+    counts = {FRAME_INPUTS: inputs, FORCE: forces}
+
+    def publisher(kind: object, topic: str, qos: object) -> SimpleNamespace:
+        return SimpleNamespace(get_subscription_count=lambda: counts[topic])
+
+    tool = ToolTopics(cast(ManagedNode, SimpleNamespace(create_publisher=publisher)), 0, '')
+    assert tool.is_recorded is bool(inputs and forces)

@@ -65,6 +65,7 @@ class TissueSimNode(ManagedNode):
         self._resumes = bool(parameter(self, 'resume', False, text))
         settings = read_section(scene, 'tissue', TissueSettings)
         labels = ('', *tool_names(scene))
+        self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
         self._tools = [ToolTopics(self, number, label) for number, label in enumerate(labels)]
         self._announced = time.monotonic()
         self._scene = scene.stem
@@ -129,7 +130,6 @@ class TissueSimNode(ManagedNode):
 
     def _connect(self) -> None:
         self._mesh_publisher = self.create_publisher(Mesh, ros.MESH, qos.LATCHED)
-        self._updates = self.create_publisher(MeshDelta, ros.MESH_UPDATES, qos.UPDATES)
         self._free_pieces = self.create_publisher(FreePiece, ros.PIECES, qos.HISTORY)
         for tool in self._tools:
             tool.connect()
@@ -167,14 +167,18 @@ class TissueSimNode(ManagedNode):
             self._diagnostics.catch_up()
 
     def _await_recorder(self, stop: Stop) -> None:
-        """Wait until a recorder has found the inputs of frames: only a complete record can be
-        re-simulated.
+        """Wait until a recorder has found inputs, forces and meshes of frames: only a complete
+        record can be re-simulated.
         """
         until = self._announced + _DISCOVERY_S
-        while time.monotonic() < until and not all(tool.is_recorded for tool in self._tools):
+        while time.monotonic() < until and not self._is_recorded():
             if stop.is_set():
                 return
             time.sleep(0.005)
+
+    def _is_recorded(self) -> bool:
+        meshes = self._updates.get_subscription_count() > 0
+        return meshes and all(tool.is_recorded for tool in self._tools)
 
     def release(self) -> None:
         """Stop the threads of state and checkpoint."""

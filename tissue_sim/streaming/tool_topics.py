@@ -33,24 +33,22 @@ class ToolTopics:
         self._newest: Contact | None = None
         self._received = 0
         self._used: Contact | None = None
-        # First, so that a recorder discovers it while the tissue is set up.
+        # First, so that a recorder discovers them while the tissue is set up.
+        self._forces = node.create_publisher(ForceSample, f'{self._prefix}{ros.FORCE}', qos.STREAM)
         self._inputs = node.create_publisher(
             FrameInputs, f'{self._prefix}{ros.FRAME_INPUTS}', qos.STREAM
         )
 
     def connect(self) -> None:
-        """Make the other topics."""
+        """Subscribe to the contacts."""
         self._topic = f'{self._prefix}{ros.CONTACT}'
-        self._forces = self._node.create_publisher(
-            ForceSample, f'{self._prefix}{ros.FORCE}', qos.STREAM
-        )
         self._contacts: Any = ros.polled(self._node, Contact, self._topic, qos.NEWEST_BEST_EFFORT)
         self._publishers = PublisherMonitor(self._node, [self._topic])
 
     @property
     def is_recorded(self) -> bool:
-        """Whether somebody listens to the inputs of the frames."""
-        return self._inputs.get_subscription_count() > 0
+        """Whether somebody listens to the inputs of the frames, and somebody to its forces."""
+        return all(p.get_subscription_count() > 0 for p in (self._inputs, self._forces))
 
     @property
     def cause(self) -> str:
