@@ -144,7 +144,7 @@ class Durations:
         return _quantiles(self._name, values, (50, 99, 99.9))
 
 
-def _integers(count: int) -> array[int]:
+def _integers(count: int) -> 'array[int]':
     """Return zeros of 64 bits. One is set in a third of the time of a NumPy array's."""
     return array('q', bytes(8 * count))
 
