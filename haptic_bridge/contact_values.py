@@ -8,9 +8,9 @@ from cutting_trainer.haptic_bridge.proxy.kernels import STATE
 from cutting_trainer.haptic_bridge.proxy.proxy import Touch
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
-from cutting_trainer.node_common.kernels import kernel
+from cutting_trainer.node_common.kernels import inner
 
-_CONTACT = record_type(
+CONTACT = record_type(
     [
         ('nodes', 'i8', (9,)),
         ('weights', 'f8', (9,)),
@@ -26,7 +26,8 @@ _CONTACT = record_type(
     ]
 )
 """Fields of `Contact` from the nodes on; all of 8 bytes."""
-_NOWHERE = Touch(np.zeros(1, STATE))
+NOWHERE = Touch(np.zeros(1, STATE))
+"""Touch of a proxy that is not used."""
 
 
 class Tick(NamedTuple):
@@ -49,22 +50,24 @@ class ContactReport:
     """Packs the contact of a tick.
 
     Args:
-        state: of the force path, dtype `force_kernels.STATE`, shape (1,).
         stiffness: of the coupling [N/m].
         radius: of the tool [m].
         number: of the tool, by its place in the list of the scene.
+
+    Attributes:
+        record: of `pack`, dtype CONTACT, shape (1,).
     """
 
-    def __init__(self, state: np.ndarray, stiffness: float, radius: float, number: int = 0) -> None:
-        self._state, self._number = state, number
-        self._contact = np.zeros(1, _CONTACT)
-        self._contact['coupling_stiffness'], self._contact['proxy_radius'] = stiffness, radius
-        self._nodes = self._contact['nodes'][0]
-        numbers = self._contact.view(np.float64)[len(self._nodes) :]
+    def __init__(self, stiffness: float, radius: float, number: int = 0) -> None:
+        self._number = number
+        self.record = np.zeros(1, CONTACT)
+        self.record['coupling_stiffness'], self.record['proxy_radius'] = stiffness, radius
+        self._nodes = self.record['nodes'][0]
+        numbers = self.record.view(np.float64)[len(self._nodes) :]
         self._numbers, self._facing = numbers[:-3], numbers[-3:]
 
     def values(
-        self, sequence: int, state: int, surface: Surface | None, touched: Touch | None, mode: int
+        self, sequence: int, state: int, surface: Surface | None, mode: int
     ) -> tuple[float, ...]:
         """Return the values of a contact, in the order of `ContactCodec`.
 
@@ -72,12 +75,9 @@ class ContactReport:
             sequence: of the tick.
             state: NONE, TOUCHING or INSIDE.
             surface: the newest of the tissue.
-            touched: contact of the proxy, or the triangle it approaches; None while it is not used.
             mode: of the tool, one of `ToolMode`.
         """
         revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
-        touch = _NOWHERE if touched is None else touched
-        _pack(self._state, touch.state, touched is not None, self._contact)
         return (
             sequence,
             state,
@@ -91,8 +91,8 @@ class ContactReport:
         )
 
 
-@kernel(nogil=True)
-def _pack(state: np.ndarray, touch: np.ndarray, touched: bool, contact: np.ndarray) -> None:
+@inner
+def pack(state: np.ndarray, touch: np.ndarray, touched: bool, contact: np.ndarray) -> None:
     """Write tool and touch to a contact; where the proxy is not used, its point is zero."""
     s, t, c = state[0], touch[0], contact[0]
     for k in range(9):

@@ -5,6 +5,8 @@ import math
 import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, safety
+from cutting_trainer.haptic_bridge.contact_values import pack
+from cutting_trainer.haptic_bridge.devices.motion_gate import judge
 from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.proxy import friction
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import spring_force, surface_stiffness
@@ -217,6 +219,28 @@ def to_tissue(setup: np.ndarray, state: np.ndarray, values: np.ndarray) -> None:
             s.facing[k] /= np.sqrt(size)
 
 
+@kernel(nogil=True)
+def take_pose(
+    setup: np.ndarray,
+    state: np.ndarray,
+    gate: np.ndarray,
+    values: np.ndarray,
+    stamp_ns: int,
+    known: bool,
+) -> int:
+    """Check a device pose and write it to the state; one that fails changes nothing.
+
+    Arguments after the state, and what is returned, are those of `MotionGate.judge`.
+    """
+    code = judge(gate, values, stamp_ns, known)
+    if code == safety.OK:
+        to_tissue(setup, state, values)
+        if not known:
+            state[0].moved[:] = 0.0
+            state[0].turned[:] = 0.0
+    return code
+
+
 @inner
 def _tissue_force(
     setup: np.ndarray,
@@ -338,8 +362,57 @@ def _follow_edge(setup: np.ndarray, state: np.ndarray) -> None:
             s.edge[end, k] = s.blade[end, k]
 
 
+@inner
+def _place_proxy(state: np.ndarray, touch: np.ndarray, used: bool, contact: int) -> None:
+    """Write the place of the proxy; one with friction is less its offset: from the tip, its depth
+    leads there. Without a proxy it is the tip.
+    """
+    s, t = state[0], touch[0]
+    for k in range(3):
+        s.proxy[k] = t.position[k] - s.stick[0].offset[k] if used else s.tip[k]
+        if used and contact == TOUCHING:
+            s.normal[k] = t.normal[k]
+
+
 @kernel(nogil=True)
-def command(
+def finish(
+    setup: np.ndarray,
+    state: np.ndarray,
+    history: np.ndarray,
+    touch: np.ndarray,
+    used: bool,
+    report: np.ndarray,
+    depth: np.ndarray,
+    contact: int,
+    enabled: bool,
+    time: int,
+    gain: float,
+    elapsed: float,
+) -> bool:
+    """Compute command and report of a tick whose contact is known: one call from Python.
+
+    Args:
+        setup, state, history, contact, enabled, time, gain, elapsed: as of `_command`.
+        touch: of the proxy, dtype `proxy.kernels.STATE`, shape (1,).
+        used: whether there is a proxy in this tick.
+        report: dtype `contact_values.CONTACT`, shape (1,); written.
+        depth: from the tip to the proxy [m], shape (3,); written where there is one.
+
+    Returns:
+        False where the result was not finite; force and torque are then zero.
+    """
+    s = state[0]
+    _place_proxy(state, touch, used, contact)
+    if used:
+        for k in range(3):
+            depth[k] = s.proxy[k] - s.tip[k]
+    finite = _command(setup, state, history, contact, enabled, time, gain, elapsed)
+    pack(state, touch, used, report)
+    return finite
+
+
+@inner
+def _command(
     setup: np.ndarray,
     state: np.ndarray,
     history: np.ndarray,

@@ -14,7 +14,7 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, force_kernels, safety
 from cutting_trainer.haptic_bridge.contact_plausibility import MAX_STEP_AHEAD, ContactPlausibility
-from cutting_trainer.haptic_bridge.contact_values import ContactReport, Tick
+from cutting_trainer.haptic_bridge.contact_values import NOWHERE, ContactReport, Tick
 from cutting_trainer.haptic_bridge.devices.motion_gate import MotionGate
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
 from cutting_trainer.haptic_bridge.hand_coupling import HandCoupling
@@ -102,6 +102,7 @@ class ForcePath:
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
         names = ('force', 'wrench', 'tip', 'blade', 'arms')
+        self._s['grips'] = self.mode.is_grasper
         self._force, self._wrench, self._tip, self._blade, self._arms = map(
             self._s.__getitem__, names
         )
@@ -116,7 +117,7 @@ class ForcePath:
         self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
         self._stiffness = tool.coupling_stiffness
         self._number = number
-        self._report = ContactReport(self._state, tool.coupling_stiffness, tool.radius, number)
+        self._report = ContactReport(tool.coupling_stiffness, tool.radius, number)
         self._pose = np.zeros(7)
         self._motion = MotionGate()
         self._pose_stamp = self._pose_ns = 0
@@ -217,15 +218,19 @@ class ForcePath:
         self._was_enabled = enabled
         gain = self._gain(now_ns, enabled)
         touched = self._touch(now_ns, surface, enabled)
-        if self._contact != INSIDE or self.mode.is_grasper:
+        if self.mode is not self.next_mode and (self._contact != INSIDE or self.mode.is_grasper):
             self.mode = self.next_mode
-        self._s['grips'] = self.mode.is_grasper
+            self._s['grips'] = self.mode.is_grasper
         if fault or state is CrtkState.FAULT:
             self._s['force'] = self._s['torque'] = 0.0
-        if not force_kernels.command(
+        if not force_kernels.finish(
             self.coupling.setup,
             self._state,
             self._history,
+            (touched or NOWHERE).state,
+            touched is not None,
+            self._report.record,
+            self._depths[self._sequence % _MAX_PENDING_CONTACTS],
             self._contact,
             enabled,
             self._pose_stamp,
@@ -239,7 +244,7 @@ class ForcePath:
         mode = self.mode
         if mode == ToolMode.CLOSED_GRASPER and not enabled:
             mode = ToolMode.OPEN_GRASPER  # without force, the jaws let go
-        contact = self._report.values(self._sequence, self._contact, surface, touched, mode)
+        contact = self._report.values(self._sequence, self._contact, surface, mode)
         return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
 
     def _take_pose(self, now_ns: int, pose: StampedMessage | None, enabled: bool) -> str:
@@ -250,15 +255,14 @@ class ForcePath:
         if pose.stamp_ns == 0 or (known and pose.stamp_ns <= self._pose_stamp):
             self.rejections.add(POSE, _OUTDATED if pose.stamp_ns else _INVALID)
             return ''
-        known = known and enabled
         self._pose[:] = pose.values
-        code = self._motion.judge(self._pose, pose.stamp_ns, known=known)
+        setup, gate = self.coupling.setup, self._motion.gate
+        code = force_kernels.take_pose(
+            setup, self._state, gate, self._pose, pose.stamp_ns, known and enabled
+        )
         if code != safety.OK:
             self.rejections.add(POSE, MessageError(safety.POSE_FAULTS[code]))
             return safety.POSE_FAULTS[code]
-        force_kernels.to_tissue(self.coupling.setup, self._state, self._pose)
-        if not known:
-            self._s['moved'] = self._s['turned'] = 0.0
         self._pose_stamp, self._pose_ns = pose.stamp_ns, now_ns
         return ''
 
@@ -378,19 +382,15 @@ class ForcePath:
             self._contact = INSIDE
             assert surface is not None
             self._s['reach'] = self._plausibility.reach(surface, self._blade)
-            self._s['proxy'] = self._tip
             return None
         if before == INSIDE or (before == TOUCHING and not enabled):
             self._leave_contact()
             self._start_ns = now_ns
         if not enabled or surface is None:
-            self._s['proxy'] = self._tip
             return None
         ground = self._undented.surface
         assert ground is not None
         touched = self._proxy.step(ground, self._undented.blend(now_ns), self._tip)
-        self._s['proxy'] = place = self._proxy.place
-        self._depths[self._sequence % _MAX_PENDING_CONTACTS] = place - self._tip
         self._contact = TOUCHING if touched.touching else NONE
         if self._contact != before:
             extrapolation.clear(self._history)
@@ -404,7 +404,6 @@ class ForcePath:
             self._began = self._sequence
             # Energy that the last contact dissipated is no credit; energy that it made is a debt.
             self._s['energy'] = min(self._s['energy'], ENERGY_CREDIT_J)
-        self._s['normal'] = touched.normal
         return touched
 
     def _follow(self, now_ns: int, surface: Surface | None) -> None:

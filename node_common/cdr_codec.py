@@ -11,12 +11,14 @@ import math
 import struct
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from cutting_trainer.node_common.rejections import MessageError, require_tool
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 _HEADER = struct.Struct('<4siII')
+_FRAME = 4
+"""Place of the frame_id among the unpacked values of a message; its numbers follow."""
 _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
 _NANOSECONDS = 1_000_000_000
 _MAX_TRAILING_PADDING = 3
@@ -77,13 +79,14 @@ class StampedCodec:
     def __init__(self, frame_id: str = '') -> None:
         self.name = type(self).__name__.removesuffix('Codec')
         self._frame = frame_id.encode() + b'\0'
-        self._packer = _body(self.layout, len(self._frame))
+        self._packer = _message(self.layout, len(self._frame))
         self._values = sum(count for _, _, count in self.layout)
         self._counts = {
             sum(count for _, _, count in self.layout[:fields]): fields
             for fields in sorted((len(self.layout), *self.older))
         }
-        self._bodies: dict[int, dict[int, struct.Struct]] = {}
+        self._messages: dict[int, dict[int, struct.Struct]] = {}
+        self._usual, self._usual_length = self._packer, -1
         self._frames: dict[bytes, str] = {}
 
     def encode(self, stamp_ns: int, values: Sequence[float]) -> bytes:
@@ -94,11 +97,13 @@ class StampedCodec:
             values: as in `StampedMessage.values`.
         """
         seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
-        left_out = self._values - len(values)
+        frame, left_out = self._frame, self._values - len(values)
+        if left_out and len(values) in self._counts:
+            values = (*values, *(0,) * left_out)
         try:
-            head = _HEADER.pack(_ENCAPSULATION, seconds, nanoseconds, len(self._frame))
-            rest = (0,) * left_out if len(values) in self._counts else ()
-            return head + self._packer.pack(self._frame, *values, *rest)
+            return self._packer.pack(
+                _ENCAPSULATION, seconds, nanoseconds, len(frame), frame, *values
+            )
         except struct.error as error:
             raise WireError(
                 'values that do not fit',
@@ -107,19 +112,27 @@ class StampedCodec:
 
     def decode(self, data: bytes) -> StampedMessage:
         """Return stamp, frame and numbers of a message in CDR bytes."""
+        usual = self._usual
+        if len(data) == usual.size:  # nearly always the layout of the message before
+            unpacked = usual.unpack(data)
+            if unpacked[0] == _ENCAPSULATION and unpacked[3] == self._usual_length:
+                return self._decoded(unpacked)
+        return self._decode_other(data)
+
+    def _decode_other(self, data: bytes) -> StampedMessage:
         size = len(data)
         if size < _HEADER.size:
             text = f'{self.name} cut short: {size} bytes are less than its header'
             raise WireError('wrong length', text)
-        encapsulation, seconds, nanoseconds, length = _HEADER.unpack_from(data)
+        encapsulation, _, _, length = _HEADER.unpack_from(data)
         if encapsulation[:2] != _ENCAPSULATION[:2]:
             raise WireError(
                 'wrong encoding',
                 f'{self.name} is not little-endian plain CDR: it starts with '
                 f'{encapsulation.hex()}, not with {_ENCAPSULATION.hex()}',
             )
-        bodies = self._bodies.get(length)
-        if bodies is None:
+        messages = self._messages.get(length)
+        if messages is None:
             if not 0 < length <= size - _HEADER.size:
                 text = f'{self.name} gives its frame_id {length} bytes of {size} in all'
                 raise WireError('wrong length', text)
@@ -127,29 +140,36 @@ class StampedCodec:
                 size, most = length - 1, MAX_FRAME_ID_LENGTH
                 text = f'{self.name} has a frame_id of {size} bytes: {most} at most'
                 raise WireError('frame_id too long', text)
-            bodies = self._bodies[length] = {
-                count: _body(self.layout[:fields], length) for count, fields in self._counts.items()
+            messages = self._messages[length] = {
+                count: _message(self.layout[:fields], length)
+                for count, fields in self._counts.items()
             }
-        whole = body = bodies[self._values]
-        if size < _HEADER.size + whole.size:
-            fitting = [b for b in bodies.values() if _HEADER.size + b.size <= size]
-            body = fitting[-1] if fitting else whole
-        if not 0 <= size - _HEADER.size - body.size <= _MAX_TRAILING_PADDING:
+        whole = message = messages[self._values]
+        if size < whole.size:
+            fitting = [m for m in messages.values() if m.size <= size]
+            message = fitting[-1] if fitting else whole
+        if not 0 <= size - message.size <= _MAX_TRAILING_PADDING:
             raise WireError(
                 'wrong length',
-                f'{self.name} with a frame_id of {length - 1} bytes has '
-                f'{_HEADER.size + whole.size} bytes, got {size}',
+                f'{self.name} with a frame_id of {length - 1} bytes has {whole.size} bytes, '
+                f'got {size}',
             )
-        unpacked = body.unpack_from(data, _HEADER.size)
-        frame, values = unpacked[0], unpacked[1:]
-        if body is not whole:
-            values += (0,) * (self._values - len(values))
+        unpacked = message.unpack_from(data)
+        if message is whole:
+            self._usual, self._usual_length = whole, length
+        else:
+            unpacked += (0,) * (_FRAME + 1 + self._values - len(unpacked))
+        return self._decoded(unpacked)
+
+    def _decoded(self, unpacked: tuple[Any, ...]) -> StampedMessage:
+        _, seconds, nanoseconds, _, frame = unpacked[: _FRAME + 1]
         name = self._frames.get(frame)
         if name is None:
             if len(self._frames) >= _FRAME_CACHE_SIZE:
                 self._frames.clear()
             name = self._frames[frame] = self._frame_name(frame)
-        return StampedMessage(seconds * _NANOSECONDS + nanoseconds, name, values)
+        stamp_ns = seconds * _NANOSECONDS + nanoseconds
+        return StampedMessage(stamp_ns, name, unpacked[_FRAME + 1 :])
 
     def believed(self, data: bytes) -> StampedMessage:
         """Return the decoded message after a plausibility check of its numbers.
@@ -186,11 +206,9 @@ class StampedCodec:
 
 
 @lru_cache(maxsize=256)
-def _body(layout: tuple[tuple[str, str, int], ...], frame_length: int) -> struct.Struct:
-    """Return the struct of all bytes after the length of frame_id. CDR aligns from the end of the
-    encapsulation.
-    """
-    codes = [f'<{frame_length}s']
+def _message(layout: tuple[tuple[str, str, int], ...], frame_length: int) -> struct.Struct:
+    """Return the struct of a message. CDR aligns from the end of the encapsulation."""
+    codes = [f'{_HEADER.format}{frame_length}s']
     offset = _HEADER.size - len(_ENCAPSULATION) + frame_length
     for _, code, count in layout:
         size = _SIZES[code]

@@ -7,7 +7,7 @@ from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.node_common.kernels import kernel
 
 _SECOND = 1e-9
-_GATE = record_type(
+GATE = record_type(
     [('last', 'f8', (7,)), ('last_ns', 'i8'), ('anchor', 'f8', (7,)), ('anchor_ns', 'i8')]
 )
 
@@ -21,7 +21,7 @@ class MotionGate:
     """
 
     def __init__(self) -> None:
-        self._gate = np.zeros(1, _GATE)
+        self.gate = np.zeros(1, GATE)
 
     def judge(self, pose: np.ndarray, stamp_ns: int, *, known: bool) -> int:
         """Return OK or a key of `safety.POSE_FAULTS`; a pose that is OK becomes the one before.
@@ -31,11 +31,12 @@ class MotionGate:
             stamp_ns: of the pose [ns], later than the one before.
             known: the pose before is that of the same motion.
         """
-        return int(_judge(self._gate, pose, stamp_ns, known))
+        return int(judge(self.gate, pose, stamp_ns, known))
 
 
 @kernel(nogil=True)
-def _judge(gate: np.ndarray, pose: np.ndarray, stamp_ns: int, known: bool) -> int:
+def judge(gate: np.ndarray, pose: np.ndarray, stamp_ns: int, known: bool) -> int:
+    """Judge a pose as `MotionGate.judge` does; gate: dtype GATE, shape (1,)."""
     g = gate[0]
     code = safety.pose_gate(pose[:3], pose[3:])
     if code != safety.OK:
