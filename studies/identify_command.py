@@ -2,7 +2,6 @@
 
 import json
 import os
-import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -27,11 +26,9 @@ from cutting_trainer.studies.designs import Setting
 from cutting_trainer.studies.evaluation import Job, SeriesResult, read_recording
 from cutting_trainer.studies.fit import Fit, Floats, Observation, Point
 from cutting_trainer.studies.identification import (
-    MESH,
     PARAMETERS,
     Estimate,
     Linearised,
-    Prior,
     estimates_of,
     identifiability,
     prior_of,
