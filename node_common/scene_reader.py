@@ -11,7 +11,7 @@ import json
 import re
 import types
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -96,26 +96,36 @@ def read_section(path: Path, section: str, model: type[M], tool: str = '') -> M:
         raise SceneError(_most_helpful(place, error.errors())) from None
 
 
-def read_document(path: Path, model: type[M], kind: str) -> M:
+def read_document(
+    path: Path,
+    model: type[M],
+    kind: str,
+    wrong: Callable[[M], list[ErrorDetails]] = lambda document: [],
+) -> M:
     """Read and check a whole file of another kind than a scene, by one model.
 
     Args:
         path: the file.
         model: model of the file, preferably derived from `SceneModel`.
         kind: name of its kind for messages, as in `study`.
+        wrong: returns errors that the types of the model cannot express.
 
     Raises:
         SceneError: one sentence with file, line, key, value and remedy.
     """
     root, document = _read(path, kind, tuple(model.model_fields))
+    place = _Place(path, '', root, model)
     try:
-        return model.model_validate_json(
+        checked = model.model_validate_json(
             json.dumps(document, default=str),
             strict=True,
             context={'folder': path.parent.resolve()},
         )
     except ValidationError as error:
-        raise SceneError(_most_helpful(_Place(path, '', root, model), error.errors())) from None
+        raise SceneError(_most_helpful(place, error.errors())) from None
+    if errors := wrong(checked):
+        raise SceneError(_most_helpful(place, errors))
+    return checked
 
 
 def tool_names(path: Path) -> tuple[str, ...]:

@@ -101,7 +101,7 @@ def write_dataset(
     if output.exists():
         raise SessionError(f'{output} exists already: name a new folder for the data set')
     tasks: dict[str, int] = {}
-    rows, first, rates = [], 0, dict[int, str]()
+    rows, about, first, rates = [], list[dict[str, Any]](), 0, dict[int, str]()
     totals: dict[str, list[Floats]] = {}
     for number, bag in enumerate(bags):
         progress(bag.name)
@@ -137,11 +137,10 @@ def write_dataset(
                     for name, values in columns.items()
                     for kind, value in _statistics(values).items()
                 },
-                'about': episode.about,
             }
         )
+        about.append(episode.about)
         first += episode.length
-    about = [row.pop('about') for row in rows]
     subjects = dict.fromkeys(of['subject'] for of in about if of['subject'])
     numbers = {subject: f'subject-{number}' for number, subject in enumerate(subjects, 1)}
     for of in about:  # a subject may have been given by a name

@@ -21,9 +21,9 @@ Floats = NDArray[np.float64]
 
 DIFFERENCE = 0.1
 """Step of the central differences of logarithms: cuts go on from element to element."""
-START_POINTS = 4
+START_POINTS = 3
 """Points of the start's design for each unknown."""
-MAX_STEPS = 6
+MAX_STEPS = 8
 _START_BAGS = 3
 _START_SPREAD = 1.5
 """Half of the design's range, and _BOUND that of the search, in spreads of the prior."""
@@ -80,6 +80,7 @@ class Fit:
         self._mean = np.log([prior.median for prior in priors.values()])
         self._spread = np.array([prior.spread for prior in priors.values()])
         self._known: dict[tuple[int, Point], Floats] = {}
+        self._untouched: set[tuple[int, int]] = set()
         self._scale = 1.0
 
     def solve(self, recorded: Floats, confidence: float) -> Linearised:
@@ -182,17 +183,27 @@ class Fit:
         return self._weighted(bag, felt - computed)
 
     def _jacobians(self, at: Floats) -> list[Floats]:
-        bags, unknowns = range(len(self._observations)), len(at)
-        steps = DIFFERENCE * np.eye(unknowns)
+        bags, unknowns = range(len(self._observations)), range(len(at))
+        steps = DIFFERENCE * np.eye(len(at))
         ends = [(self._point(at + step), self._point(at - step)) for step in steps]
-        self._need([(bag, point) for bag in bags for pair in ends for point in pair])
+        touched = [(bag, i) for bag in bags for i in unknowns if (bag, i) not in self._untouched]
+        self._need([(bag, point) for bag, i in touched for point in ends[i]])
+        self.forces(at)
+        slopes = {}
+        for bag, i in touched:
+            up, down = (self._known[bag, point] for point in ends[i])
+            between = self._known[bag, self._point(at)]
+            failed = [bool(np.isnan(end).any()) for end in (up, down)]
+            width = 2.0 * DIFFERENCE if not any(failed) else DIFFERENCE
+            up, down = (between if failed[0] else up), (between if failed[1] else down)
+            slopes[bag, i] = self._weighted(bag, up - down) / width
+            if not any(failed) and np.array_equal(
+                up, down
+            ):  # a hand that does not cut never meets the toughness
+                self._untouched.add((bag, i))
         return [
             np.column_stack(
-                [
-                    self._weighted(bag, self._known[bag, up] - self._known[bag, down])
-                    / (2.0 * DIFFERENCE)
-                    for up, down in ends
-                ]
+                [slopes.get((bag, i), np.zeros(self._felt[bag].size)) for i in unknowns]
             )
             for bag in bags
         ]

@@ -108,7 +108,7 @@ def deviations(times: Floats, felt: Floats, noise: float) -> Floats:
     means = window_means(times, felt)
     samples = max(len(times) / len(means), 1.0)
     size = np.linalg.norm(means, axis=1, keepdims=True)
-    return np.sqrt(noise**2 / samples + (MODEL_ERROR * size) ** 2) * np.ones(3)
+    return np.asarray(np.sqrt(noise**2 / samples + (MODEL_ERROR * size) ** 2) * np.ones(3), float)
 
 
 @dataclass(frozen=True)
@@ -145,12 +145,12 @@ class Linearised:
     @cached_property
     def information(self) -> Floats:
         """Information of the bags without the prior, shape (p, p)."""
-        return np.asarray(sum(j.T @ j for j in self.jacobians) / self.scale)
+        return np.asarray(sum(j.T @ j for j in self.jacobians) / self.scale, float)
 
     @cached_property
     def covariance(self) -> Floats:
         """Posterior covariance of the unknowns, shape (p, p)."""
-        return np.linalg.inv(self.information + np.diag(self.prior_spread**-2.0))
+        return np.asarray(np.linalg.inv(self.information + np.diag(self.prior_spread**-2.0)), float)
 
     def step(self, weights: Floats | None = None) -> Floats:
         """Return the Gauss-Newton step to the maximum of the posterior, shape (p,).
@@ -164,7 +164,7 @@ class Linearised:
         pull = sum(n * (j.T @ r) for n, j, r in parts) / self.scale
         precision = self.prior_spread**-2.0
         pull = pull + precision * (self.prior_mean - self.at)
-        return np.linalg.solve(matrix + np.diag(precision), pull)
+        return np.asarray(np.linalg.solve(matrix + np.diag(precision), pull), float)
 
     def bootstrap_spread(self, seed: int = 0) -> Floats | None:
         """Return standard deviations over bags drawn with replacement, shape (p,).

@@ -198,7 +198,9 @@ class _Running:
 
     def compute(self, wanted: Iterable[tuple[int, Point]]) -> dict[tuple[int, Point], Floats]:
         """Return computed forces by bag and point, NaN where they cannot be computed."""
-        settings = {(bag, point): self._changes | self._constants(point) for bag, point in wanted}
+        settings = {
+            (bag, point): {**self._changes, **self._constants(point)} for bag, point in wanted
+        }
         return self._series(settings)
 
     def refined(
@@ -210,9 +212,9 @@ class _Running:
         for number, bag in enumerate(self._bags):
             recording = read_recording(str(bag.path), bag.hash)
             mesh = write_refined(recording.bag, folder.resolve(), changes)
-            settings[number, point] = (
-                self._changes | self._constants(point) | {_MESH_KEY: str(mesh)}
-            )
+            settings[number, point] = {**self._changes, **self._constants(point)} | {
+                _MESH_KEY: str(mesh)
+            }
         found = self._series(settings)
         forces = [found[number, point] for number in range(len(self._bags))]
         if any(np.isnan(each).any() for each in forces):

@@ -207,7 +207,7 @@ def _judge(truth: dict[str, float], problem: Linearised) -> dict[str, tuple[floa
         if name != MESH:
             value, true = float(np.exp(at)), truth[name]
             width = (np.exp(at + half) - np.exp(at - half)) / value
-            judged[name] = (value / true - 1.0, float(width), abs(at - np.log(true)) <= half)
+            judged[name] = (value / true - 1.0, float(width), bool(abs(at - np.log(true)) <= half))
     return judged
 
 
