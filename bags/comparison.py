@@ -272,7 +272,7 @@ def _check_frame(
         contacts = recorded_contacts(record, simulation.mesh)
     except ValueError as error:
         raise _Differs(f'the contact that loaded this frame is refused now: {error}') from None
-    frame = computed.frame(*contacts)
+    frame = computed.frame(*contacts, concession=record.concession)
     if frame.diverged != record.diverged:
         raise _Differs(f'it {("did not diverge", "diverged")[record.diverged]} when recorded')
     for felt, tool in zip(frame.by_tool, record.by_tool, strict=True):

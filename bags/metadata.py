@@ -13,7 +13,7 @@ from cutting_trainer.bags.untrusted_yaml import MAX_BYTES, load_yaml
 from cutting_trainer.node_common.code_identity import CodeIdentity, identity_of
 from cutting_trainer.node_common.yaml_bounds import YamlBoundError, read_bounded
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 """Version of our additions to rosbag2's format; grows with each change that a reader must know."""
 METADATA_FILE = 'metadata.yaml'
 _SIMULATION = '/tissue_sim'

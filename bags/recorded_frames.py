@@ -75,6 +75,7 @@ class FrameRecord:
         force: `ForceSample` of the frame, None where the bag lacks it.
         others: contacts of the further tools, by number; None where the bag lacks their inputs.
         indexing: as of a `ToolRecord`, of the first tool.
+        concession: see `Frame`.
     """
 
     step: int
@@ -89,6 +90,7 @@ class FrameRecord:
     force: StampedMessage | None
     others: tuple[ToolRecord | None, ...] = ()
     indexing: Indexing | None = None
+    concession: int = 0
 
     @property
     def by_tool(self) -> tuple[ToolRecord | None, ...]:
@@ -231,6 +233,7 @@ def read_run(bag: Bag, number: int = 0) -> tuple[list[FrameRecord], Restart | No
             answer_frames=getattr(m, 'answer_frames', 0),
             diverged=m.diverged,
             others=tuple(other.get(m.step) for other in others),
+            concession=getattr(m, 'concession', 0),
             **vars(first[m.step]),
         )
         for m in inputs

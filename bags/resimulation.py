@@ -111,9 +111,9 @@ class Resimulation:
         self._resolve(outcome, result)
         return outcome
 
-    def frame(self, *contacts: ToolContact | None) -> Frame:
-        """Compute a frame under the contacts of the tools."""
-        frame = self.simulation.frame(*contacts)
+    def frame(self, *contacts: ToolContact | None, concession: int = 0) -> Frame:
+        """Compute a frame under the contacts of the tools; `concession` as of a `Frame`."""
+        frame = self.simulation.frame(*contacts, concession=concession)
         self.substeps += frame.substeps
         self.diverged += frame.diverged
         if self._cut.ask(frame, self.answer_frames(frame.step)):
@@ -152,7 +152,8 @@ def as_recorded(records: Sequence[FrameRecord], computed: Resimulation) -> Itera
             raise BagError(f'frame {record.step} cannot be computed again: {what}')
         if lacks := lacking_contact(record):
             raise BagError(f'frame {record.step} cannot be computed again: {lacks}')
-        yield computed.frame(*recorded_contacts(record, computed.simulation.mesh))
+        contacts = recorded_contacts(record, computed.simulation.mesh)
+        yield computed.frame(*contacts, concession=record.concession)
 
 
 def lacking_contact(record: FrameRecord) -> str:

@@ -1,6 +1,7 @@
 """The bag of a session that this machine has just computed, with the sample's hand: no graph."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +72,26 @@ def watched(scene: Scene, every: int) -> Watched:
     return computed
 
 
+def conceding(frame: Callable[..., Frame], concessions: Mapping[int, int]) -> Callable[..., Frame]:
+    """Frames with concessions, from some of them on."""
+    numbers, now = count(1), 0
+
+    def conceded(*contacts: Any, concession: int = 0) -> Frame:
+        nonlocal now
+        now = concessions.get(next(numbers), now)
+        return frame(*contacts, concession=now)
+
+    return conceded
+
+
 def make_session(
     sample: Path,
     folder: Path,
     temporary: Path,
     every: int = 0,
     modes: Mapping[int, ToolMode] | None = None,
+    changes: Mapping[str, str] | None = None,
+    concessions: Mapping[int, int] | None = None,
 ) -> Path:
     """Writes the bag of a session: the hand of a sample, everything else computed now.
 
@@ -86,19 +101,27 @@ def make_session(
         temporary: for the scene.
         every: frames from one whole state in the bag to the next; 0: it has none.
         modes: that the tool takes at the beginning of some frames.
+        changes: of the sample's scene, by dotted key.
+        concessions: of the tissue, from some frames on, by their number.
     """
     bag = open_bag(sample)
-    scene = load_scene(str(restore_scene(bag, temporary)))
+    file = restore_scene(bag, temporary, changes)
+    scene = load_scene(str(file))
     codec = PoseStampedCodec()
     poses = [codec.decode(m.data) for m in bag.messages([POSE])]
     hand = Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))
     computed = watched(scene, every) if every else recomputation(scene)
     simulation = computed.simulation
+    if concessions:
+        simulation.frame = conceding(simulation.frame, concessions)  # type: ignore[method-assign]
     about = read_metadata(sample)['custom_data'] | {'format_version': str(FORMAT_VERSION)}
+    if changes:
+        about['scene'] = file.read_text(encoding='utf-8')
     writer = BagWriter(folder, custom_data=about | identity_here().flat())
     for topic in (MESH, UPDATES, FORCE, INPUTS, CONTACT, POSE):
         kind = bag.topics()[topic]
-        writer.add_topic(topic, kind, bag.schemas[kind], '', bag.profiles(topic))
+        text = schema_text(kind) if topic == INPUTS else bag.schemas[kind]
+        writer.add_topic(topic, kind, text, '', bag.profiles(topic))
     for topic in (STATE, MEMORY) if every else ():
         writer.add_topic(topic, STATE_TYPE, schema_text(STATE_TYPE), '', bag.profiles(FORCE))
     encoder = DeltaEncoder(simulation.mesh, simulation.displacement)
@@ -143,6 +166,7 @@ def make_session(
             answer=answer,
             cut_step=cut_step if answer else 0,
             answer_frames=ANSWER_FRAMES,
+            concession=frame.concession,
         )
         inputs.header.stamp = stamp(time)
         write(CONTACT, time, ContactCodec('tissue').encode(contact.stamp_ns, contact.values))

@@ -33,7 +33,7 @@ from cutting_trainer.recordings.attempts_command import (
 from cutting_trainer.session.attempts import STORE_FILE, attempt_data, next_attempt, open_store
 from cutting_trainer.session.errors import SessionError
 
-SAMPLE = PACKAGES / 'bags' / 'samples' / 'format_6' / 'straight_cut'
+SAMPLE = PACKAGES / 'bags' / 'samples' / 'format_7' / 'straight_cut'
 
 
 def row(bag, subject='a', points=50.0, number=1, exercise='circle') -> AttemptRow:

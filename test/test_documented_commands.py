@@ -28,7 +28,7 @@ from cutting_trainer.session.node_commands import node_environment
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[1]
-SESSION = ROOT / 'bags' / 'samples' / 'format_6' / 'straight_cut'
+SESSION = ROOT / 'bags' / 'samples' / 'format_7' / 'straight_cut'
 PROGRAMS = (
     r'(?:\./trainer|python|ros2|colcon|sudo|pip|source|eval|rviz2|ssh|pre-commit|cd|\.trainer/)'
 )
@@ -82,12 +82,12 @@ PACKAGED = Nowhere('needs ROS from packages, which cannot be installed beside th
 PEERS = Nowhere('the peers are no dependency; test_peers.py tries what needs none of them')
 HERE = (
     'picture BAG -o liver.png',
-    'picture bags/samples/format_6/crossing_cuts -o crossing_cuts.png',
+    'picture bags/samples/format_7/crossing_cuts -o crossing_cuts.png',
     'picture BAG',
     'report BAG -o report.html',
     'resimulate BAG',
     'resimulate BAG --with tissue.material.toughness=40',
-    'resimulate bags/samples/format_6/crossing_cuts --with tissue.integration.frequency_growth=2',
+    'resimulate bags/samples/format_7/crossing_cuts --with tissue.integration.frequency_growth=2',
     'export BAG tables',
     'export BAG mesh.vtu --at 12',
     'repair BAG',
@@ -99,7 +99,7 @@ HERE = (
 """Commands of `./trainer` that a test runs in this process."""
 PROGRAMS_OF_OWN = {
     './trainer run python my_node.py': 'mine',
-    './trainer run python largest_force.py bags/samples/format_6/straight_cut': 'N after',
+    './trainer run python largest_force.py bags/samples/format_7/straight_cut': 'N after',
 }
 """Run here by a process, and what they say."""
 SHOWN = {

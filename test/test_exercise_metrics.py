@@ -34,7 +34,7 @@ from cutting_trainer.exercises.scene_schema import (
 from cutting_trainer.exercises.score import score
 from cutting_trainer.node_common.share_folder import PACKAGES
 
-SAMPLE = PACKAGES / 'bags' / 'samples' / 'format_6' / 'straight_cut'
+SAMPLE = PACKAGES / 'bags' / 'samples' / 'format_7' / 'straight_cut'
 
 
 def wall(line: np.ndarray, depth: float, cells: int = 4) -> SimpleNamespace:

@@ -112,7 +112,7 @@ def test_reference_says_the_qos_that_is_offered() -> None:
 
 
 def test_example_that_reads_a_bag_finds_the_largest_force(tmp_path: Path) -> None:
-    folder = SAMPLES / 'format_6' / 'straight_cut'
+    folder = SAMPLES / 'format_7' / 'straight_cut'
     script = tmp_path / 'largest_force.py'
     script.write_text(LARGEST)
     done = subprocess.run(

@@ -49,7 +49,7 @@ SAMPLES = Path(__file__).parents[1] / 'bags' / 'samples'
 OF_TISSUE = (INPUTS, MESH, UPDATES, FORCE)
 BAGS = sorted(path.parent for path in SAMPLES.glob('format_*/*/metadata.yaml'))
 NEWEST = BAGS[-1].parent
-CUT = SAMPLES / 'format_6' / 'straight_cut'
+CUT = SAMPLES / 'format_7' / 'straight_cut'
 FORMER_CUT = SAMPLES / 'format_2' / 'straight_cut'
 
 

@@ -24,7 +24,7 @@ from cutting_trainer.studies.summary import as_text, summarise, write_page
 from cutting_trainer.studies.table import Row, write_table
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLES = ROOT / 'bags' / 'samples' / 'format_6'
+SAMPLES = ROOT / 'bags' / 'samples' / 'format_7'
 GOOD = """\
 bags: [bags]
 settings:

@@ -30,7 +30,7 @@ from cutting_trainer.studies.table import COSTS_FILE, TABLE_FILE
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLES = ROOT / 'bags' / 'samples' / 'format_6'
+SAMPLES = ROOT / 'bags' / 'samples' / 'format_7'
 STUDY = f"""\
 bags: [{SAMPLES}/palpation, {SAMPLES}/straight_cut, damaged]
 settings:

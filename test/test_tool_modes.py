@@ -19,7 +19,7 @@ from cutting_trainer.recordings.what_if import computable_poses, run_experiment
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
-SAMPLE = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_6' / 'straight_cut'
+SAMPLE = Path(__file__).parents[1] / 'bags' / 'samples' / 'format_7' / 'straight_cut'
 MODE = ContactCodec.fields['mode'].start
 PALPATOR, SCALPEL = ToolMode.PALPATOR, ToolMode.SCALPEL
 

@@ -27,9 +27,11 @@ from cutting_trainer.tissue_sim.assembly import as_planned, make_simulation
 from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.motion.far_field import SHARES
 from cutting_trainer.tissue_sim.planner.monitor import PlanMonitor
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.simulation.checkpoint import Checkpoint, read_checkpoint
+from cutting_trainer.tissue_sim.simulation.governor import Governor
 from cutting_trainer.tissue_sim.simulation.state import state_of
 from cutting_trainer.tissue_sim.streaming import messages
 from cutting_trainer.tissue_sim.streaming.cut_client import CutClient
@@ -81,7 +83,9 @@ class TissueSimNode(ManagedNode):
         self._link = LinkBudget(
             float(parameter(self, 'mesh_bandwidth', 0.0, text, within=(0.0, 1e12)))
         )
-        self._loop = PeriodicLoop(settings.integration.rate)
+        rate = settings.integration.rate
+        self._loop = PeriodicLoop(rate)
+        self._governor = Governor(1 / rate, self._simulation.dynamics.possible_concessions)
         self._encoder = messages.DeltaEncoder(self._simulation.mesh, self._simulation.displacement)
         self._encoder.revision = 0 if before is None else before.revision
         self._pieces = PieceRegister(self._simulation.mesh)
@@ -151,7 +155,7 @@ class TissueSimNode(ManagedNode):
         self._loop.start()
         self._ticked = time.monotonic()
         while not stop.is_set() and not self.ended:
-            self._loop.wait()
+            late = self._loop.wait() * 1e-9
             self._yield_place()
             self._cuts.wait(stop.is_set, self._diagnostics.catch_up)
             self._ticked = time.monotonic()  # a wait is no stall
@@ -159,6 +163,7 @@ class TissueSimNode(ManagedNode):
                 return
             with self._lock:
                 self._tick()
+            self._govern(time.monotonic() - self._ticked, late)
             self._diagnostics.catch_up()
 
     def _await_recorder(self, stop: Stop) -> None:
@@ -182,7 +187,8 @@ class TissueSimNode(ManagedNode):
         touched = resolved.touched
         is_recorded = self._publish_state()
         mesh = self._simulation.mesh
-        frame = self._simulation.frame(*(tool.contact(mesh) for tool in self._tools))
+        contacts = (tool.contact(mesh) for tool in self._tools)
+        frame = self._simulation.frame(*contacts, concession=self._governor.concession)
         felt = list(zip(self._tools, frame.by_tool, strict=True))
         over = self._plan.follow(frame) if self._plan else ''
         if over:
@@ -212,6 +218,22 @@ class TissueSimNode(ManagedNode):
         if is_recorded:
             self._cuts.request_state(self._encoder.revision, frame.step)
         self._cuts.ask(frame, self._encoder.revision)
+
+    def _govern(self, spent: float, late: float) -> None:
+        """Decide what the next frame concedes, and say where that changes."""
+        before = self._governor.concession
+        self._governor.follow(spent, late)
+        now = self._governor.concession
+        if now == before:
+            return
+        share = round(100 * SHARES[now])
+        if now > before:
+            self.get_logger().warning(
+                f'frames come late: {share} % of the chosen nodes move on their own from now on, '
+                'until there is time again'
+            )
+        else:
+            self.get_logger().info(f'frames are in time: {share} % of the chosen nodes again')
 
     def _tell_pieces(self, frame: Frame) -> None:
         """Publish the pieces that came off, once the blade has left the tissue."""
@@ -304,6 +326,7 @@ class TissueSimNode(ManagedNode):
             'step_bound': simulation.dynamics.bound(),
             'active_nodes': simulation.dynamics.active_nodes,
             'inverted': simulation.dynamics.inverted,
+            'concession': self._governor.concession,
             'mesh_bytes': self._link.sent,
             'deltas_held_back': self._link.held_back,
         }
@@ -340,6 +363,10 @@ class TissueSimNode(ManagedNode):
             return DiagnosticStatus.WARN, 'max_substeps is too small for real time', values
         if self._plan and self._plan.unmet:
             return DiagnosticStatus.WARN, self._plan.unmet, values
+        if frame.concession:
+            share = round(100 * SHARES[frame.concession])
+            said = f'frames come late: {share} % of the chosen nodes move on their own'
+            return DiagnosticStatus.WARN, said, values
         said = frame.state.name.lower() if frame.state else 'no contact'
         return DiagnosticStatus.OK, said, values
 

@@ -9,6 +9,7 @@ they can be compared node by node.
 import argparse
 import time
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -144,7 +145,11 @@ class FarFieldSession:
         self._model, self._place = model, np.array([*place, BLOCK[2]])
 
     def run(
-        self, active: ActiveSettings, like: Course | None = None, frames: int = FRAMES
+        self,
+        active: ActiveSettings,
+        like: Course | None = None,
+        frames: int = FRAMES,
+        concession: int = 0,
     ) -> Course:
         """Return the session.
 
@@ -152,6 +157,7 @@ class FarFieldSession:
             active: which nodes move.
             like: the session whose cuts are applied; None: `combined` cuts.
             frames: so many, from the first.
+            concession: of every frame, see `FarField.concede`.
         """
         mesh = block(self._bricks, self._seed)
         simulation = TissueSimulation(
@@ -178,7 +184,7 @@ class FarFieldSession:
             if asks.due:
                 asks.resolve(CutOutcome.EMPTY)
             touched_slots = None if delta is None else simulation.apply_cut(delta)
-            frame = simulation.frame(contact)
+            frame = simulation.frame(contact, concession=concession)
             asks.ask(frame)
             encoder.encode(simulation.displacement, frame.step, 0, touched_slots, frame.step)
             times.append(time.thread_time() - began - spent)
@@ -264,6 +270,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('tetrahedra', type=int, choices=sorted(BRICKS))
     parser.add_argument('--nodes', type=int, nargs='+', default=[300, 500, 1000])
+    parser.add_argument('--concessions', type=int, nargs='+', default=[0])
     parser.add_argument('--model', choices=MODELS, default='linear')
     parser.add_argument('--seed', type=int, default=0)
     options = parser.parse_args()
@@ -271,9 +278,9 @@ def main() -> None:
     session = FarFieldSession(options.tetrahedra, options.seed, (0.047, 0.053), options.model)
     exact = session.run(ActiveSettings())
     print(f'{exact.elements_cut} elements cut; all nodes: {_frames(exact)}')
-    for nodes in options.nodes:
-        course = session.run(ActiveSettings('budget', nodes), exact)
-        print(f'{nodes} nodes: {_frames(course)}')
+    for nodes, concession in product(options.nodes, options.concessions):
+        course = session.run(ActiveSettings('budget', nodes), exact, FRAMES, concession)
+        print(f'{nodes} nodes, {concession} concessions: {_frames(course)}')
         for name, phase in PHASES.items():
             e = session.errors(course, exact, phase)
             soft = '' if phase.rests < 0 else f'compliance {100 * e.compliance:.2f} %, '

@@ -66,7 +66,8 @@ SUBJECTS = {
             2: 'it needs a live session on a quiet machine: `./trainer bench timing`',
             3: 'a tissue has one thread: there is no option of cores yet',
             4: 'a thousand strokes take minutes: `./trainer bench strokes`',
-            5: 'there is no governor yet',
+            5: 'it needs a live session on a quiet machine: '
+            '`python -m bench.figures.scale_governor`',
             6: 'it needs a reader',
         },
     ),

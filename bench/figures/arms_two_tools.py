@@ -4,9 +4,6 @@
 """
 
 import argparse
-import json
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -14,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.figures.figure import Figure
+from bench.common.json_answer import json_answer
+from bench.figures.figure import Figure, print_figures
 from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.node_common.cdr_codec import (
     ForceSampleCodec,
@@ -26,7 +24,6 @@ from cutting_trainer.tissue_sim.contact.tool import ContactState
 SECONDS = 20.0
 PERIOD_S, RATE_HZ = 1e-3, 30.0
 TOOLS = ('', '/grasper')
-LIMIT_S = 240.0
 
 
 def measure(seconds: float = SECONDS) -> list[Figure]:
@@ -38,25 +35,9 @@ def measure(seconds: float = SECONDS) -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix='trainer-') as folder:
         bag = Path(folder) / 'bag'
         arguments = ('demo', '--scene', 'two_tools', '--seconds', f'{seconds:g}', '--json')
-        _trainer(*arguments, '--domain', 'free', '--bag', str(bag))
-        again = _trainer('resimulate', str(bag), '--json')
+        json_answer(*arguments, '--domain', 'free', '--bag', str(bag))
+        again = json_answer('resimulate', str(bag), '--json')
         return [*_loops(open_bag(bag)), *_tissue(open_bag(bag)), *_same(again)]
-
-
-def _trainer(*words: str) -> dict[str, Any]:
-    """Return what a command prints as JSON, whatever its exit status."""
-    done = subprocess.run(
-        [sys.executable, '-m', 'cutting_trainer.cli.main', *words],
-        env=os.environ | {'COLUMNS': '200'},
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-    )
-    if not done.stdout.startswith('{'):
-        raise RuntimeError(f'{words[0]} gave nothing: {done.stderr[-400:]}')
-    answer: dict[str, Any] = json.loads(done.stdout)
-    return answer
 
 
 def _stamps(bag: Bag, topic: str, codec: Any) -> np.ndarray:
@@ -106,11 +87,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=SECONDS, help='duration [s]')
     figures = measure(parser.parse_args().seconds)
-    for figure in figures:
-        verdict = 'ok   ' if figure.passes else 'SHORT'
-        print(f'{verdict} {figure.name}: {figure.value:.5g}, {figure.side} {figure.bound:.5g}')
-    print(f'load of the machine, 1 and 5 minutes: {os.getloadavg()[:2]}')
-    return 0 if all(figure.passes for figure in figures) else 1
+    return print_figures(figures)
 
 
 if __name__ == '__main__':

@@ -1,6 +1,7 @@
 """A measured figure beside the bound that it must keep."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Literal
@@ -44,3 +45,12 @@ def figures_of(name: str) -> list[Figure]:
     """Return the figures that a module of this folder measures."""
     measure: Callable[[], list[Figure]] = import_module(f'bench.figures.{name}').measure
     return measure()
+
+
+def print_figures(figures: Sequence[Figure]) -> int:
+    """Print figures with the load of the machine; return 1 where one falls short."""
+    for figure in figures:
+        verdict = 'ok   ' if figure.passes else 'SHORT'
+        print(f'{verdict} {figure.name}: {figure.value:.5g}, {figure.side} {figure.bound:.5g}')
+    print(f'load of the machine, 1 and 5 minutes: {os.getloadavg()[:2]}')
+    return 0 if all(figure.passes for figure in figures) else 1

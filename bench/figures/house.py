@@ -12,7 +12,7 @@ PRODUCT_BEFORE, REPOSITORY_BEFORE = 48_519, 81_581
 MAX_WHAT = 1.0
 """Docstrings of other libraries say "what" 0.1 times in a thousand words."""
 SAMPLES = ('palpation', 'straight_cut')
-"""Bags of bags/samples/format_6 that are computed again."""
+"""Bags of bags/samples/format_7 that are computed again."""
 _NOT_INSTALLED = ('test', 'bench', 'launch', 'setup.py', 'trainer')
 
 
@@ -75,7 +75,7 @@ def _lines() -> list[Figure]:
 
 
 def _sessions() -> list[Figure]:
-    same = sum(_is_identical(ROOT / 'bags' / 'samples' / 'format_6' / name) for name in SAMPLES)
+    same = sum(_is_identical(ROOT / 'bags' / 'samples' / 'format_7' / name) for name in SAMPLES)
     name = 'recorded sessions computed again, exactly or but for rounding'
     return [Figure(5, name, same, len(SAMPLES), 'at least', '', len(SAMPLES))]
 

@@ -22,7 +22,7 @@ from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.journal import JOURNAL_FILE
 from cutting_trainer.studies.table import TABLE_FILE
 
-SAMPLES = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_6'
+SAMPLES = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7'
 TIMED_ROWS = 12
 """Rows of a bag of 5 s, each with another toughness, for one worker and for two."""
 REFERENCE_ROWS = 6

@@ -25,7 +25,7 @@ from cutting_trainer.exercises.scene_schema import (
     TargetSettings,
 )
 
-SAMPLE = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_6' / 'straight_cut'
+SAMPLE = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7' / 'straight_cut'
 EXERCISES = ('vessel',)
 """The one with a cut that is cheap to play."""
 COUNT = 2

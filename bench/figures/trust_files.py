@@ -17,7 +17,7 @@ from cutting_trainer.recordings import (
     resimulate_command,
 )
 
-SAMPLE = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_6' / 'palpation'
+SAMPLE = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7' / 'palpation'
 TOPICS = ('/tissue/mesh', '/tissue/force', '/tool/contact')
 COPIES = 36
 MESSAGES, IN_CHUNK = 120, 10

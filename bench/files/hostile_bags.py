@@ -128,7 +128,7 @@ def scene(**custom_data: Any) -> Callable[[Path], None]:
     """Return a valid sample with another description."""
 
     def make(folder: Path) -> None:
-        sample = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_6' / 'palpation'
+        sample = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7' / 'palpation'
         shutil.copytree(sample, folder)
         path = folder / METADATA_FILE
         content = yaml.safe_load(path.read_text())

@@ -94,7 +94,7 @@ def failures_of(cuts: list[Cut], spread: float) -> list[str]:
 
 
 def _run(hand: Path, bag: Path, busy: int) -> Cut:
-    with _kept_busy(busy):
+    with kept_busy(busy):
         status = _call('replay', str(hand), '--domain', 'free', '--output', str(bag))
     recorded = open_bag(bag)
     replica = read_story(bag, None).replica
@@ -108,8 +108,8 @@ def _call(*arguments: str) -> int:
 
 
 @contextlib.contextmanager
-def _kept_busy(count: int) -> Iterator[None]:
-    """Keep some cores busy."""
+def kept_busy(count: int) -> Iterator[None]:
+    """Keep some processors busy, at the priority of this process."""
     processes = [subprocess.Popen(_BUSY) for _ in range(count)]
     try:
         yield

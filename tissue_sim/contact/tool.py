@@ -156,6 +156,7 @@ class Frame:
         strain: of a model with a law, else None.
         tool: number of the tool that feels it.
         others: the same frame, as the other tools feel it, in order.
+        concession: steps by which fewer nodes moved on their own, see `FarField.concede`.
     """
 
     step: int
@@ -176,6 +177,7 @@ class Frame:
     turning: Turning = NOT_TURNED
     tool: int = 0
     others: tuple['Frame', ...] = ()
+    concession: int = 0
 
     @property
     def by_tool(self) -> tuple['Frame', ...]:

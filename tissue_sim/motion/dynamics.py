@@ -35,7 +35,7 @@ from cutting_trainer.tissue_sim.motion.active_region import (
 )
 from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
 from cutting_trainer.tissue_sim.motion.elastic_state import ElasticState
-from cutting_trainer.tissue_sim.motion.far_field import FarField
+from cutting_trainer.tissue_sim.motion.far_field import SHARES, FarField
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
 from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
 from cutting_trainer.tissue_sim.motion.loads import Loads
@@ -179,6 +179,21 @@ class Dynamics:
     def inverse_mass(self) -> np.ndarray:
         """Inverse mass by coordinate, 0 where fixed [1/kg], shape (3 n,); a view."""
         return self._inverse[: 3 * self.mesh.node_count]
+
+    @property
+    def concession(self) -> int:
+        """Steps by which fewer nodes than chosen move on their own."""
+        return 0 if self._far is None else self._far.concession
+
+    @property
+    def possible_concessions(self) -> int:
+        """Number of steps that there are: none without a far field."""
+        return 0 if self._far is None else len(SHARES) - 1
+
+    def concede(self, steps: int) -> None:
+        """Let fewer nodes of a far field move on their own; see `FarField.concede`."""
+        if self._far is not None:
+            self._far.concede(steps)
 
     @property
     def active_nodes(self) -> int:

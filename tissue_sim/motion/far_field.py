@@ -31,6 +31,8 @@ _CELLS_PER_NODE = 0.5
 """Cells of the grid, as a share of the free nodes."""
 _MOVES = 0.05
 """Way of the tool, relative to the radius of the free nodes, after which they are chosen anew."""
+SHARES = 1.0, 0.7, 0.5
+"""Shares of the free nodes after 0, 1 and 2 concessions; docs/performance.md has their price."""
 _LEVELS = 3
 _BENT, _STAYS_BENT = 0.12, 0.08
 """|F - I| at which a node becomes free, and at least has to be to stay so: up to there the tangent
@@ -130,6 +132,9 @@ class FarField:
     Args:
         model: the elastic model.
         nodes: how many are free.
+
+    Attributes:
+        concession: steps by which fewer are free.
     """
 
     whole = True
@@ -138,6 +143,7 @@ class FarField:
     def __init__(self, model: ElasticModel, nodes: int) -> None:
         self._model = model
         self._nodes = nodes
+        self.concession = 0
         n = model.mesh.node_count
         cells = max(1, round(_CELLS_PER_NODE * nodes))
         self._grid = CoarseGrid(model.mesh, model.neighbours, cells)
@@ -171,6 +177,18 @@ class FarField:
     def near(self) -> np.ndarray:
         """Nodes whose rows and domains are evaluated as they are, sorted, shape (b,)."""
         return np.flatnonzero(self._level <= 1)
+
+    def concede(self, steps: int) -> None:
+        """Leave fewer nodes around the tools free, from the next choice on.
+
+        Those that a tool loads, and those that are bent, stay free.
+
+        Args:
+            steps: place in `SHARES`; beyond the last: the last.
+        """
+        steps = min(steps, len(SHARES) - 1)
+        self._changed |= steps != self.concession
+        self.concession = steps
 
     def operands(self) -> Operands:
         """Return the operands of the part that is evaluated as it is."""
@@ -357,8 +375,9 @@ class FarField:
         if len(self._centres):
             rank = np.empty(n)
             _rank(model.mesh.rest, self._centres, rank)
-            rank[held_nodes(couplings)] = -1.0
-            most = min(self._nodes, n) - 1
+            held = held_nodes(couplings)
+            rank[held] = -1.0
+            most = min(max(len(held), round(SHARES[self.concession] * self._nodes), 1), n) - 1
             free = np.argpartition(rank, most)[: most + 1]
             self._radius = float(np.sqrt(max(rank[free].max(), 0.0)))
         free = np.union1d(free, np.flatnonzero(bent > _STAYS_BENT**2))

@@ -117,11 +117,12 @@ class TissueSimulation:
         self.dynamics.resume(displacement)
         self.step = step
 
-    def frame(self, *contacts: ToolContact | None) -> Frame:
+    def frame(self, *contacts: ToolContact | None, concession: int = 0) -> Frame:
         """Simulate one frame.
 
         Args:
             contacts: newest contact of each tool, or None; missing ones are None.
+            concession: steps by which fewer nodes move on their own, see `Dynamics.concede`.
 
         Returns:
             The frame as the first tool feels it, with those of the others. With `command` set, an
@@ -134,6 +135,7 @@ class TissueSimulation:
             raise ValueError(f'{len(contacts)} contacts for {len(self.tools)} tools')
         given = [*contacts, *[None] * (len(self.tools) - len(contacts))]
         self.step += 1
+        self.dynamics.concede(concession)
         jumps = [tool.jump(contact) for tool, contact in zip(self.tools, given, strict=True)]
         acting: list[ToolInFrame] = []
         in_frame: list[ToolInFrame | None] = []
@@ -187,6 +189,7 @@ class TissueSimulation:
             trouble=jump or motion.trouble,
             strain=motion.strain,
             tool=number,
+            concession=self.dynamics.concession,
         )
         if motion.diverged or jump:
             self._finish_due |= tool.release()

@@ -166,6 +166,7 @@ def inputs_message(
         time_ns: stamp [ns].
     """
     message = FrameInputs(step=frame.step, diverged=frame.diverged, tool=frame.tool)
+    message.concession = frame.concession
     message.answer, message.cut_step = int(resolved.outcome), resolved.cut_step
     message.answer_frames, message.waited = ANSWER_FRAMES, resolved.waited
     message.header.frame_id = FRAME
