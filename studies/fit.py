@@ -1,7 +1,7 @@
 """Search for the constants under which computed forces are nearest to recorded ones."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +9,6 @@ from scipy.optimize import least_squares
 from scipy.stats import qmc
 
 from cutting_trainer.studies.identification import (
-    MESH,
-    MESH_PRIOR,
     Linearised,
     Prior,
     deviations,
@@ -117,27 +115,18 @@ class Fit:
         )
 
     def with_mesh(self, problem: Linearised, refined: Sequence[Floats]) -> Linearised:
-        """Return the problem with the share of the mesh as one more unknown.
+        """Return the problem with the error of the mesh.
 
         Args:
             problem: without it.
             refined: forces of each bag on the refined mesh at the solution [N], each (n, 3).
         """
         point = self._point(problem.at)
-        slopes = [
+        changes = [
             self._weighted(bag, forces - self._known[bag, point])
             for bag, forces in enumerate(refined)
         ]
-        parts = zip(problem.jacobians, slopes, strict=True)
-        return Linearised(
-            names=(*problem.names, MESH),
-            at=np.append(problem.at, 0.0),
-            residuals=problem.residuals,
-            jacobians=[np.column_stack(pair) for pair in parts],
-            prior_mean=np.append(problem.prior_mean, MESH_PRIOR[0]),
-            prior_spread=np.append(problem.prior_spread, MESH_PRIOR[1]),
-            confidence=problem.confidence,
-        )
+        return replace(problem, mesh=changes)
 
     def forces(self, at: Floats) -> list[Floats]:
         """Return the computed forces of all bags [N], each of shape (n, 3)."""

@@ -7,8 +7,9 @@ whose correlation in time widens it. The posterior is Gaussian around its maximu
 *Information Theory, Inference, and Learning Algorithms*, 2003, chapter 27). A bootstrap over bags,
 one Gauss-Newton step each, checks it: hands differ by more than noise.
 
-The mesh is an unknown, too: a bag computed on the mesh refined once gives the direction in which
-forces still change. Quadratic convergence would move them by 4/3 of it (Richardson).
+The mesh errs, too: a bag computed on the mesh refined once gives the direction in which its forces
+still change. Quadratic convergence would move them by 4/3 of it (Richardson); each bag has a share
+of its own, because the error depends on where the tool meets the elements. It is marginalised.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,10 +32,9 @@ PARAMETERS = {
     'friction': '-',
 }
 """Constants of `tissue.material` that can be identified, and their units."""
-MESH = 'mesh'
-"""Name of the unknown that scales the change of forces by a finer mesh."""
 MESH_PRIOR = (4.0 / 3.0, 2.0 / 3.0)
-"""Mean and standard deviation of that unknown: quadratic convergence, and from 0 to linear."""
+"""Mean and standard deviation of the share of that change: quadratic convergence, and between none
+and linear."""
 WINDOW_S = 0.05
 MODEL_ERROR = 0.1
 """Error of the model as a share of the force, before its scale is estimated."""
@@ -49,6 +49,7 @@ _UNTOUCHED = 0.9
 _UNCLEAR = 0.3
 """Half of an interval, as a logarithm, above which the correlated constant is named."""
 _CORRELATED = 0.9
+_SCALE_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,14 @@ class Linearised:
     """Problem around its solution.
 
     Attributes:
-        names: of the unknowns; `MESH` may be the last.
-        at: unknowns: logarithms of constants, and the share of the mesh, shape (p,).
+        names: of the unknown constants.
+        at: their logarithms, shape (p,).
         residuals: of each bag, each shape (m,); recorded less computed.
         jacobians: of the computed values, each shape (m, p).
         prior_mean, prior_spread: shape (p,).
         confidence: of the intervals.
+        mesh: change of the computed values of each bag by a finer mesh, each shape (m,); (): not
+            known.
     """
 
     names: tuple[str, ...]
@@ -131,21 +134,36 @@ class Linearised:
     prior_mean: Floats
     prior_spread: Floats
     confidence: float = 0.95
+    mesh: Sequence[Floats] = ()
 
     @cached_property
+    def _white(self) -> tuple[list[Floats], list[Floats], float]:
+        """Residuals and Jacobians without the error of the mesh, and the variance of a residual."""
+        raw = list(self.residuals)
+        if self.mesh:
+            raw = [r - MESH_PRIOR[0] * of for r, of in zip(raw, self.mesh, strict=True)]
+        residuals, jacobians, scale = raw, list(self.jacobians), _variance(raw, len(self.names))
+        for _ in range(_SCALE_ROUNDS):
+            if self.mesh:
+                residuals, jacobians = (
+                    [_without(x, change, scale) for x, change in zip(of, self.mesh, strict=True)]
+                    for of in (raw, self.jacobians)
+                )
+            step = self._step(residuals, jacobians, scale)
+            left = [r - j @ step for r, j in zip(residuals, jacobians, strict=True)]
+            scale = _variance(left, len(self.names))
+        return residuals, jacobians, scale
+
+    @property
     def scale(self) -> float:
         """Variance of a residual, widened by the correlation of neighbours in time."""
-        total = sum(float(r @ r) for r in self.residuals)
-        count = sum(int(np.count_nonzero(r)) for r in self.residuals)
-        free = max(count - len(self.names), 1)
-        lagged = sum(float(r[3:] @ r[:-3]) for r in self.residuals)  # three components a window
-        rho = min(max(lagged / total, 0.0), 0.9) if total > 0.0 else 0.0
-        return max(total / free, 1e-12) * (1.0 + rho) / (1.0 - rho)
+        return self._white[2]
 
     @cached_property
     def information(self) -> Floats:
         """Information of the bags without the prior, shape (p, p)."""
-        return np.asarray(sum(j.T @ j for j in self.jacobians) / self.scale, float)
+        _, jacobians, scale = self._white
+        return np.asarray(sum(j.T @ j for j in jacobians) / scale, float)
 
     @cached_property
     def covariance(self) -> Floats:
@@ -158,11 +176,20 @@ class Linearised:
         Args:
             weights: how often each bag counts, shape (bags,); None: once.
         """
-        counts = np.ones(len(self.residuals)) if weights is None else weights
-        parts = list(zip(counts, self.jacobians, self.residuals, strict=True))
-        matrix = sum(n * (j.T @ j) for n, j, _ in parts) / self.scale
-        pull = sum(n * (j.T @ r) for n, j, r in parts) / self.scale
+        return self._step(*self._white, weights)
+
+    def _step(
+        self,
+        residuals: Sequence[Floats],
+        jacobians: Sequence[Floats],
+        scale: float,
+        weights: Floats | None = None,
+    ) -> Floats:
+        counts = np.ones(len(residuals)) if weights is None else weights
+        parts = list(zip(counts, jacobians, residuals, strict=True))
+        matrix = sum(n * (j.T @ j) for n, j, _ in parts) / scale
         precision = self.prior_spread**-2.0
+        pull = sum(n * (j.T @ r) for n, j, r in parts) / scale
         pull = pull + precision * (self.prior_mean - self.at)
         return np.asarray(np.linalg.solve(matrix + np.diag(precision), pull), float)
 
@@ -196,6 +223,25 @@ class Linearised:
         return self.at + self.step()
 
 
+def _variance(residuals: Sequence[Floats], unknowns: int) -> float:
+    """Return the variance of a residual, widened by the correlation of neighbours in time."""
+    total = sum(float(r @ r) for r in residuals)
+    count = sum(int(np.count_nonzero(r)) for r in residuals)
+    lagged = sum(float(r[3:] @ r[:-3]) for r in residuals)  # three components a window
+    rho = min(max(lagged / total, 0.0), 0.9) if total > 0.0 else 0.0
+    return max(total / max(count - unknowns, 1), 1e-12) * (1.0 + rho) / (1.0 - rho)
+
+
+def _without(values: Floats, change: Floats, scale: float) -> Floats:
+    """Return values, shape (m,) or (m, p), whitened by an error along the change by the mesh."""
+    size = float(change @ change)
+    if size == 0.0:
+        return values
+    taken = 1.0 - 1.0 / np.sqrt(1.0 + MESH_PRIOR[1] ** 2 * size / scale)
+    along = change / np.sqrt(size)
+    return np.asarray(values - taken * np.multiply.outer(along, along @ values), float)
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A constant with its interval.
@@ -219,8 +265,6 @@ def estimates_of(problem: Linearised, priors: Mapping[str, Prior]) -> dict[str, 
     spread = problem.bootstrap_spread()
     found = {}
     for i, (name, at) in enumerate(zip(problem.names, problem.estimates, strict=True)):
-        if name == MESH:
-            continue
         half = problem.half_widths[i]
         found[name] = Estimate(
             value=float(np.exp(at)),
@@ -239,8 +283,6 @@ def identifiability(problem: Linearised) -> list[str]:
     spreads = np.sqrt(np.diag(problem.covariance))
     correlation = problem.covariance / np.outer(spreads, spreads)
     for i, name in enumerate(problem.names):
-        if name == MESH:
-            continue
         alone = 1.0 / np.sqrt(problem.information[i, i] + problem.prior_spread[i] ** -2.0)
         if alone > _UNTOUCHED * problem.prior_spread[i]:
             sentences.append(
@@ -254,13 +296,9 @@ def identifiability(problem: Linearised) -> list[str]:
         others[i] = 0.0
         other = int(others.argmax())
         sentences.append(
-            f'these bags cannot tell {name} from {_phrase(problem.names[other])}'
+            f'these bags cannot tell {name} from {problem.names[other]}'
             if others[other] > _CORRELATED
             else f'these bags determine {name} poorly, to a factor of '
             f'{np.exp(problem.half_widths[i]):.2f}'
         )
     return sentences
-
-
-def _phrase(name: str) -> str:
-    return 'the error of the mesh' if name == MESH else name

@@ -170,7 +170,7 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
     notes = [without] if without else []
     if not without:
         problem = fit.with_mesh(problem, refined)
-    forces = fit.forces(problem.at[: len(names)])
+    forces = fit.forces(problem.at)
     return Identification(
         estimates=estimates_of(problem, priors),
         sentences=[*identifiability(problem), *notes, *running.failures()],

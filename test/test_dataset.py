@@ -14,7 +14,7 @@ from cutting_trainer.studies.bag_collection import find_bags
 from cutting_trainer.studies.dataset import EPISODES_FILE, INFO_FILE, write_dataset
 from cutting_trainer.studies.evaluation import read_recording
 
-SAMPLES = Path(__file__).resolve().parents[1] / 'bags' / 'samples' / 'format_6'
+SAMPLES = Path(__file__).resolve().parents[1] / 'bags' / 'samples' / 'format_7'
 
 
 def test_data_set_has_the_files_of_its_format_and_the_figures_of_its_bags(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ import pytest
 
 from cutting_trainer.studies.fit import Fit, Observation
 from cutting_trainer.studies.identification import (
-    MESH,
     Linearised,
     Prior,
     estimates_of,
@@ -22,7 +22,7 @@ from cutting_trainer.studies.identification import (
 from cutting_trainer.studies.refined_mesh import refine
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLES = ROOT / 'bags' / 'samples' / 'format_6'
+SAMPLES = ROOT / 'bags' / 'samples' / 'format_7'
 TRUTH = {'youngs_modulus': 7000.0, 'toughness': 150.0}
 TIMES = np.arange(0.0, 3.0, 0.01)
 NOISE = 0.003
@@ -97,8 +97,16 @@ def test_what_bags_cannot_tell_is_said_and_what_they_tell_is_not() -> None:
     said_of_both = identifiability(problem([one, one + 1e-3 * other], both))
     assert 'cannot tell youngs_modulus from toughness' in said_of_both[0]
     assert 'cannot tell toughness from youngs_modulus' in said_of_both[1]
-    (said,) = identifiability(problem([one, one], ('youngs_modulus', MESH)))
-    assert 'cannot tell youngs_modulus from the error of the mesh' in said
+
+
+def test_an_error_along_the_change_by_the_mesh_widens_the_interval_and_is_taken_off() -> None:
+    one, other = np.random.default_rng(2).standard_normal((2, 600))
+    plain = problem([one], ('youngs_modulus',))
+    along, across = replace(plain, mesh=[one, one]), replace(plain, mesh=[other, other])
+    assert along.covariance[0, 0] > 50 * plain.covariance[0, 0]
+    assert across.covariance[0, 0] == pytest.approx(plain.covariance[0, 0], rel=0.05)
+    shifted = replace(across, residuals=[r + 4 / 3 * other for r in plain.residuals])
+    assert shifted.estimates == pytest.approx(plain.estimates, abs=0.02)
 
 
 def test_bags_that_say_nothing_leave_the_prior() -> None:

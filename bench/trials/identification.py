@@ -40,12 +40,12 @@ from cutting_trainer.studies.bag_collection import find_bags
 from cutting_trainer.studies.cluster import own_cluster
 from cutting_trainer.studies.evaluation import warm_up
 from cutting_trainer.studies.fit import Observation
-from cutting_trainer.studies.identification import MESH, Linearised, deviations, window_means
+from cutting_trainer.studies.identification import Linearised, deviations, window_means
 from cutting_trainer.studies.identify_command import Identification, IdentifyOptions, identify
 
 Floats = NDArray[np.float64]
 
-SAMPLES = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_6'
+SAMPLES = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7'
 SIZE = (0.04, 0.03, 0.01)
 CELLS = (8, 6, 2)
 """Bricks of the mesh that identifies; the one that emulates has twice as many along each axis."""
@@ -204,10 +204,9 @@ def _judge(truth: dict[str, float], problem: Linearised) -> dict[str, tuple[floa
     """Return relative error, relative width and coverage of each constant."""
     judged = {}
     for name, at, half in zip(problem.names, problem.estimates, problem.half_widths, strict=True):
-        if name != MESH:
-            value, true = float(np.exp(at)), truth[name]
-            width = (np.exp(at + half) - np.exp(at - half)) / value
-            judged[name] = (value / true - 1.0, float(width), bool(abs(at - np.log(true)) <= half))
+        value, true = float(np.exp(at)), truth[name]
+        width = (np.exp(at + half) - np.exp(at - half)) / value
+        judged[name] = (value / true - 1.0, float(width), bool(abs(at - np.log(true)) <= half))
     return judged
 
 
@@ -230,7 +229,6 @@ def main(arguments: list[str] | None = None) -> int:
             for name, kept in every.items():
                 kept += [one[name] for one in judged]
             line = {'seed': seed, 'truth': truth, 'error_width_inside': judged[0],
-                    'mesh': float(found.problem.estimates[-1]),
                     'inside': {n: sum(one[n][2] for one in judged) for n in RANGES},
                     'resimulations': found.computed, 'processor_time': found.cpu,
                     'wall': time.monotonic() - began, 'notes': found.sentences}  # fmt: skip
