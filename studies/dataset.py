@@ -96,7 +96,7 @@ def write_dataset(
 
     Raises:
         BagError: a bag lacks a stream.
-        SessionError: the folder exists, rates differ, or a file does not say what was written.
+        SessionError: the folder exists, rates differ, or a file differs from its bag when read back.
     """
     if output.exists():
         raise SessionError(f'{output} exists already: name a new folder for the data set')

@@ -102,7 +102,7 @@ class SeriesResult(Result):
     """A computed row with its force.
 
     Attributes:
-        series: what the hand felt at each pose.
+        series: force on the hand at each pose.
     """
 
     series: RecordedForce | None = None

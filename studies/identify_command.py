@@ -76,7 +76,7 @@ class Identification:
 
     Attributes:
         estimates: by constant.
-        sentences: about what the bags do not determine, and about bags and mesh.
+        sentences: about constants that the bags do not determine, bags, and mesh.
         computed: number of re-simulations.
         cpu: processor time of these [s].
         problem: around the solution.

@@ -1,4 +1,4 @@
-"""Data sets for learning: the files of LeRobot's format, and that they say what the bags say."""
+"""Data sets for learning: the files of LeRobot's format, and their agreement with the bags."""
 
 import json
 import shutil

@@ -171,14 +171,12 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer study config/studies/toughness.yaml -o bags/sessions/toughness': Nowhere(
         'takes a minute, and ten bags: test_studies_on_dask.py computes another study'
     ),
-    './trainer identify bags/sessions/study -o bags/sessions/identified': Elsewhere(
-        'test_identification.py::'
-        'test_the_command_finds_the_modulus_of_a_palpation_and_says_that_nothing_was_cut'
+    './trainer identify bags/sessions/study -o bags/sessions/identified': Nowhere(
+        'takes minutes, and ten bags: test_identification.py identifies another one'
     ),
     './trainer export bags/sessions/study bags/sessions/dataset --format lerobot --licence '
-    'CC-BY-4.0': Elsewhere(
-        'test_dataset.py::test_data_set_has_the_files_of_its_format_and_the_figures_of_its_bags'
-    ),
+    'CC-BY-4.0': Nowhere('needs ten bags: test_dataset.py exports others'),
+    'python -m bench.trials.identification': Nowhere('takes an hour'),
     './trainer run dask scheduler': SCHEDULER,
     './trainer run dask worker tcp://HOST:8786 --nthreads 1': SCHEDULER,
     './trainer study config/studies/toughness.yaml --scheduler tcp://HOST:8786': SCHEDULER,
