@@ -34,6 +34,8 @@ from cutting_trainer.node_common.stamps import nanoseconds
 from cutting_trainer.tissue_sim.contact.tool import CutOutcome
 
 _TRAILING_NS = 100_000_000
+_FIRST_WITH_INPUTS = 2
+"""Version of the format."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,13 @@ def segments(bag: Bag) -> list[Segment]:
 
 def _inputs(bag: Bag, tool: str = '') -> Iterator[tuple[int, Recorded, Any]]:
     if INPUTS not in bag.topics():
-        raise BagError(f'{bag.path} has no topic {INPUTS}: it is older than format version 2')
+        if not bag.complete:
+            reason = 'it was cut off before its first frame'
+        elif int(bag.custom_data.get('format_version', '1')) < _FIRST_WITH_INPUTS:
+            reason = f'it is older than format version {_FIRST_WITH_INPUTS}'
+        else:
+            reason = 'no tissue was computed while it was recorded'
+        raise BagError(f'{bag.path} has no topic {INPUTS}: {reason}')
     return runs(bag, Sequence(bag, f'{tool}{INPUTS}'))
 
 

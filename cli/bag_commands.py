@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -13,6 +13,7 @@ from rich.status import Status
 
 from cutting_trainer.cli.bag_errors import reading
 from cutting_trainer.cli.options import EXIT_STATUSES, AsJson, BagArgument, Changes, Domain
+from cutting_trainer.session.errors import SessionError
 
 commands = typer.Typer()
 
@@ -148,22 +149,41 @@ def export(
     output: Annotated[
         Path,
         typer.Argument(
-            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), or a folder for tables.'
+            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), or a folder for tables '
+            'or a data set.'
         ),
     ],
     at: Annotated[
         float | None, typer.Option(min=0.0, help='Moment of the mesh [s] (default: the end).')
     ] = None,
-    parquet: Annotated[
-        bool, typer.Option('--parquet', help='Write tables as Parquet, not as CSV.')
-    ] = False,
+    form: Annotated[
+        Literal['csv', 'parquet', 'lerobot'],
+        typer.Option(
+            '--format',
+            help='Of tables: csv, parquet; lerobot: a data set of all bags below the folder.',
+        ),
+    ] = 'csv',
+    data_licence: Annotated[
+        str,
+        typer.Option('--licence', help='Licence of the recordings for lerobot, as CC-BY-4.0.'),
+    ] = '',
     as_json: AsJson = False,
 ) -> None:
-    """Write a bag's poses and forces as CSV or Parquet, or its tissue as a mesh."""
+    """Write a bag's poses and forces as tables, its tissue as a mesh, or bags as a data set."""
+    if form == 'lerobot':
+        from cutting_trainer.studies.bag_collection import find_bags
+        from cutting_trainer.studies.dataset import write_dataset
+
+        if at is not None:
+            raise SessionError('--at is the time of a mesh: a data set has whole sessions')
+        with _working('reading the bags'), reading(bag):
+            files = write_dataset(find_bags([str(bag)], Path.cwd()), output, data_licence)
+        _tell_written(files, as_json=as_json)
+        return
     from cutting_trainer.recordings.export_command import export as write
 
     with _working('reading the bag'), reading(bag):
-        files = write(bag, output, at, parquet=parquet)
+        files = write(bag, output, at, parquet=form == 'parquet')
     _tell_written(files, as_json=as_json)
 
 

@@ -36,3 +36,53 @@ def study(
     from cutting_trainer.studies.study_command import StudyOptions, run_study
 
     raise typer.Exit(int(run_study(StudyOptions(file, output, workers, scheduler, as_json))))
+
+
+@commands.command(epilog=EXIT_STATUSES)
+def identify(
+    bags: Annotated[
+        list[str], typer.Argument(help='Bags, folders with bags anywhere below, or globs.')
+    ],
+    output: Annotated[Path, typer.Option('--output', '-o', help='Folder of the results.')] = Path(
+        'identified'
+    ),
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(
+            '--parameter',
+            help='A constant of tissue.material; may be given again (default: those above 0 in '
+            'the scene).',
+        ),
+    ] = None,
+    noise: Annotated[
+        float,
+        typer.Option(min=1e-6, max=10.0, help='Noise of one component of the force, rms [N].'),
+    ] = 0.003,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option('--with', help='Change a key of the scene, as key=value.'),
+    ] = None,
+    workers: Annotated[
+        int, typer.Option(min=0, max=1024, help='Own workers; 0: one for each processor.')
+    ] = 0,
+    scheduler: Annotated[
+        str,
+        typer.Option(help='Address of a Dask scheduler whose workers compute, as tcp://host:8786.'),
+    ] = '',
+    as_json: AsJson = False,
+) -> None:
+    """Find the material under which recorded hands feel the recorded forces. Needs no ROS."""
+    from cutting_trainer.session.scene_overrides import parse_changes
+    from cutting_trainer.studies.identify_command import IdentifyOptions, run_identification
+
+    options = IdentifyOptions(
+        bags=tuple(bags),
+        output=output,
+        parameters=tuple(parameters or ()),
+        noise=noise,
+        changes=parse_changes(changes or []),
+        workers=workers,
+        scheduler=scheduler,
+        as_json=as_json,
+    )
+    raise typer.Exit(int(run_identification(options)))

@@ -8,10 +8,12 @@ derived from `SceneModel` and reads it with `read_section`. YAML 1.2 applies: `1
 import functools
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
+from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
@@ -99,28 +101,36 @@ def read_section(path: Path, section: str, model: type[M], tool: str = '') -> M:
         raise SceneError(most_helpful(place, error.errors())) from None
 
 
-def read_document(path: Path, model: type[M], kind: str) -> M:
+def read_document(
+    path: Path,
+    model: type[M],
+    kind: str,
+    wrong: Callable[[M], list[ErrorDetails]] = lambda document: [],
+) -> M:
     """Read and check a whole file of another kind than a scene, by one model.
 
     Args:
         path: the file.
         model: model of the file, preferably derived from `SceneModel`.
         kind: name of its kind for messages, as in `study`.
+        wrong: returns errors that the types of the model cannot express.
 
     Raises:
         SceneError: one sentence with file, line, key, value and remedy.
     """
     root, document = _read(path, kind, tuple(model.model_fields))
+    place = SectionPlace(path, '', root, model)
     try:
-        return model.model_validate_json(
+        checked = model.model_validate_json(
             json.dumps(document, default=str),
             strict=True,
             context={'folder': path.parent.resolve()},
         )
     except ValidationError as error:
-        raise SceneError(
-            most_helpful(SectionPlace(path, '', root, model), error.errors())
-        ) from None
+        raise SceneError(most_helpful(place, error.errors())) from None
+    if errors := wrong(checked):
+        raise SceneError(most_helpful(place, errors))
+    return checked
 
 
 def tool_names(path: Path) -> tuple[str, ...]:

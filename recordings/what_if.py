@@ -53,6 +53,7 @@ class Run:
         times: times of the ticks since the first pose [s], shape (n,).
         forces: norm of the force on the hand [N], shape (n,).
         contact: contact flag, shape (n,).
+        vectors: force on the hand in the frame of the device [N], shape (n, 3).
         area: area of the incision, one side, at rest [m^2].
         elements_cut: number of tetrahedra removed by cuts.
         tetrahedra: number of tetrahedra at the end.
@@ -63,6 +64,7 @@ class Run:
     times: np.ndarray
     forces: np.ndarray
     contact: np.ndarray
+    vectors: np.ndarray
     area: float
     elements_cut: int
     tetrahedra: int
@@ -134,7 +136,7 @@ class Hand:
         surface, sample: newest surface and force sample; the next tick takes the sample.
         contact: contact of the last tick, None before the first.
         mode: recorded of the tool last; None before the first contact.
-        ticks: time [ns], norm of the force [N] and contact flag of each tick.
+        ticks: time [ns], norm of the force [N], contact flag and force [N] of each tick.
         indexings: recorded changes of how the hand moves the tool, that are to come.
         indexing: the last one; None before the first.
     """
@@ -145,7 +147,7 @@ class Hand:
     sample: StampedMessage | None = None
     contact: StampedMessage | None = None
     mode: int | None = None
-    ticks: list[tuple[int, float, bool]] = field(default_factory=list)
+    ticks: list[tuple[int, float, bool, tuple[float, ...]]] = field(default_factory=list)
     indexings: deque[Indexing] = field(default_factory=deque)
     indexing: Indexing | None = None
 
@@ -183,22 +185,25 @@ class Hand:
         if self.state is CrtkState.DISABLED and self.path.is_fresh(now):
             self.state = CrtkState.ENABLED
         self.contact = StampedMessage(tick.contact_stamp_ns, '', tick.contact)
-        self.ticks.append((now, self.path.force_norm, self.path.contact != NONE))
+        force = tick.wrench[WrenchStampedCodec.fields['force']]
+        self.ticks.append((now, self.path.force_norm, self.path.contact != NONE, force))
 
 
 @dataclass(frozen=True)
 class RecordedForce:
-    """Force on the hand as recorded, in answer to each pose.
+    """Force on the hand in answer to each pose.
 
     Attributes:
         times: stamps of the poses [ns], shape (n,).
         forces: norm of the force on the hand [N], shape (n,).
         contact: contact flag, shape (n,).
+        vectors: force on the hand in the frame of the device [N], shape (n, 3).
     """
 
     times: np.ndarray
     forces: np.ndarray
     contact: np.ndarray
+    vectors: np.ndarray
 
 
 def run_experiment(bag: Bag, scene: Scene, computed: Resimulation) -> Run:
@@ -232,8 +237,8 @@ def move_hand(
     computed.answer_frames = answer_frames(records)
     for _ in closed_loop(poses, untils, hand, computed):
         pass
-    times, forces, contact = (np.array(column) for column in zip(*hand.ticks, strict=True))
-    return _run(times, forces, contact, computed)
+    times, forces, contact, vectors = map(np.array, zip(*hand.ticks, strict=True))
+    return _run(RecordedForce(times, forces, contact, vectors), computed)
 
 
 def recorded_run(bag: Bag, computed: Resimulation) -> tuple[Run, int | None]:
@@ -277,7 +282,7 @@ def recompute(records: Sequence[FrameRecord], computed: Resimulation) -> int | N
 
 def as_felt(felt: RecordedForce, computed: Resimulation) -> Run:
     """Return a recomputed session with the recorded force on the hand."""
-    return _run(felt.times, felt.forces, felt.contact, computed)
+    return _run(felt, computed)
 
 
 def recorded_force(bag: Bag, poses: Sequence[StampedMessage]) -> RecordedForce:
@@ -289,15 +294,16 @@ def recorded_force(bag: Bag, poses: Sequence[StampedMessage]) -> RecordedForce:
     state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
     times = np.array([pose.stamp_ns for pose in poses])
     touched = _at(bag, CONTACT, ContactCodec(), times)[:, state].ravel() != NONE
-    forces = np.linalg.norm(_at(bag, SERVO_CF, WrenchStampedCodec(), times)[:, force], axis=1)
-    return RecordedForce(times, forces, touched)
+    vectors = _at(bag, SERVO_CF, WrenchStampedCodec(), times)[:, force]
+    return RecordedForce(times, np.linalg.norm(vectors, axis=1), touched, vectors)
 
 
-def _run(times: np.ndarray, forces: np.ndarray, contact: np.ndarray, computed: Resimulation) -> Run:
+def _run(felt: RecordedForce, computed: Resimulation) -> Run:
     return Run(
-        times=(times - times[0]) * _NANOSECOND_S,
-        forces=forces,
-        contact=contact,
+        times=(felt.times - felt.times[0]) * _NANOSECOND_S,
+        forces=felt.forces,
+        contact=felt.contact,
+        vectors=felt.vectors,
         area=computed.area,
         elements_cut=computed.simulation.elements_cut,
         tetrahedra=len(computed.simulation.mesh.tetrahedra),

@@ -1,9 +1,21 @@
 """Study files: bags, settings and outputs, checked as scenes are."""
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, Field, JsonValue, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Field,
+    JsonValue,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
 
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
@@ -42,7 +54,19 @@ def _scene_key(key: str) -> str:
         raise ValueError(f'{section} is not a section of a scene: {hint}')
     if not path:
         raise ValueError('give section and key, as in tissue.material.toughness')
+    _fields(key)
+    return key
+
+
+def _fields(key: str) -> list[FieldInfo]:
+    """Return the fields that a dotted key of a scene may mean.
+
+    Raises:
+        ValueError: there is none.
+    """
+    section, *path = key.split('.')
     models: list[type[BaseModel]] = [MODELS[section]]
+    fields: list[FieldInfo] = []
     for part in path:
         fields = [m.model_fields[part] for m in models if part in m.model_fields]
         if not fields:
@@ -53,7 +77,7 @@ def _scene_key(key: str) -> str:
             hint = f'did you mean {near}?' if near else f'known are {", ".join(known)}'
             raise ValueError(f'{part} is not a key of a scene there: {hint}')
         models = [inner for field in fields for inner in models_in(field.annotation)]
-    return key
+    return fields
 
 
 def _output(name: str) -> str:
@@ -157,4 +181,47 @@ def read_study(path: Path) -> Study:
     Raises:
         SceneError: one sentence with file, line, key, value and remedy.
     """
-    return read_document(path, Study, 'study')
+    return read_document(path, Study, 'study', _wrong_values)
+
+
+def _wrong_values(study: Study) -> list[ErrorDetails]:
+    """Return an error for each value of a setting that its scene key cannot have."""
+    return [
+        ErrorDetails(type='value_error', loc=('settings', *place), msg=said, input=value,
+                     ctx={'error': said})
+        for place, key, value in _values(study.settings)
+        if (said := _refusal(key, value))
+    ]  # fmt: skip
+
+
+def _values(designs: Designs) -> Iterator[tuple[tuple[int | str, ...], str, JsonValue]]:
+    """Yield the place below `settings`, the scene key and the value of all that is set."""
+    for key, values in designs.grid.items():
+        yield from ((('grid', key, i), key, value) for i, value in enumerate(values))
+    for i, case in enumerate(designs.cases):
+        yield from ((('cases', i, key), key, value) for key, value in case.items())
+    for name in ('latin_hypercube', 'sobol'):
+        sampled: Sampled | None = getattr(designs, name)
+        for key, within in sampled.ranges.items() if sampled else ():
+            for end in ('low', 'high'):
+                yield (name, 'ranges', key, end), key, getattr(within, end)
+
+
+def _refusal(key: str, value: JsonValue) -> str:
+    """Return why a scene key cannot have a value; '': it can."""
+    said = ''
+    for field in _fields(key):
+        if field.annotation is Path:  # relative to the restored scene, which is not there yet
+            return ''
+        kind: Any = Annotated[(field.annotation, field)]
+        adapter: TypeAdapter[Any] = TypeAdapter(kind)
+        try:
+            adapter.validate_json(json.dumps(value), strict=True)
+        except ValidationError as error:
+            first = error.errors()[0]
+            reason = first['msg'][:1].lower() + first['msg'][1:]
+            about = f' ({field.description})' if field.description else ''
+            said = f'{json.dumps(value)[:60]} is refused: {reason}{about}'
+        else:
+            return ''
+    return said

@@ -30,6 +30,7 @@ from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation
 from cutting_trainer.recordings.what_if import (
     RecordedForce,
+    Run,
     as_felt,
     computable_poses,
     move_hand,
@@ -60,12 +61,14 @@ class Job:
         bag_hash: hash of its content.
         setting: changes of the scene.
         identity: code of whoever asks; a worker with other code refuses.
+        series: the force over time is wanted, too.
     """
 
     bag: str
     bag_hash: str
     setting: Setting
     identity: Identity
+    series: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,17 @@ class Result:
     warm_up: float
     memory: int
     lost: bool = False
+
+
+@dataclass(frozen=True)
+class SeriesResult(Result):
+    """A computed row with its force.
+
+    Attributes:
+        series: force on the hand at each pose.
+    """
+
+    series: RecordedForce | None = None
 
 
 class OtherCodeError(RuntimeError):
@@ -130,12 +144,13 @@ def evaluate(job: Job) -> Result:
     began = time.thread_time()
     warm_up()
     warm, differs, failure, outputs = time.thread_time(), 0, '', dict[str, float]()
+    run: Run | None = None
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
-            outputs, differs = _compute(job, Path(temporary))
+            outputs, differs, run = _compute(job, Path(temporary))
         except Exception as error:  # a row with its reason: the study goes on
             failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
-    return Result(
+    result = Result(
         outputs=outputs,
         failure=failure,
         differs_from_frame=differs,
@@ -144,6 +159,10 @@ def evaluate(job: Job) -> Result:
         warm_up=warm - began,
         memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     )
+    if run is None or not job.series:
+        return result
+    series = RecordedForce(run.times, run.forces, run.contact, run.vectors)
+    return SeriesResult(**vars(result), series=series)
 
 
 @cache
@@ -160,8 +179,8 @@ def warm_up() -> None:
     warm_up_force_path(ToolSettings(), device, HapticsSettings(), device.load_profile())
 
 
-def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int]:
-    """Return the outputs of a row, and the first frame that differs from the recording."""
+def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int, Run]:
+    """Return the outputs of a row, the first frame that differs from the recording, and the run."""
     recording = read_recording(job.bag, job.bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
     scene = load_scene(str(restore_scene(bag, folder, job.setting.in_yaml)))
@@ -172,7 +191,7 @@ def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int]:
     else:
         differs = recompute(recording.records, computed)
         run = as_felt(felt, computed)
-    return outputs_of(run, felt.forces, computed.simulation.mesh), differs or 0
+    return outputs_of(run, felt.forces, computed.simulation.mesh), differs or 0, run
 
 
 @lru_cache(maxsize=_KEPT_BAGS)

@@ -173,6 +173,12 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer study config/studies/toughness.yaml -o bags/sessions/toughness': Nowhere(
         'takes a minute, and ten bags: test_studies_on_dask.py computes another study'
     ),
+    './trainer identify bags/sessions/study -o bags/sessions/identified': Nowhere(
+        'takes minutes, and ten bags: test_identification.py identifies another one'
+    ),
+    './trainer export bags/sessions/study bags/sessions/dataset --format lerobot --licence '
+    'CC-BY-4.0': Nowhere('needs ten bags: test_dataset.py exports others'),
+    'python -m bench.trials.identification': Nowhere('takes an hour'),
     './trainer run dask scheduler': SCHEDULER,
     './trainer run dask worker tcp://HOST:8786 --nthreads 1': SCHEDULER,
     './trainer study config/studies/toughness.yaml --scheduler tcp://HOST:8786': SCHEDULER,

@@ -55,6 +55,16 @@ BAD_EDITS = [
     ('logarithm of nothing', 'low: 50', 'low: 0', 9, ['scale log', 'above 0']),
     ('one sample', 'samples: 5', 'samples: 1', 7, ['samples', '1', 'number of settings']),
     ('samples of Sobol', 'latin_hypercube', 'sobol', 6, ['samples is 5', 'as 4 or 8']),
+    (
+        'value below its bound',
+        '[100, 200]',
+        '[100, -1]',
+        4,
+        ['-1', 'greater than or equal to 0', 'J/m^2'],
+    ),
+    ('word for a number', '[100, 200]', '[100, tough]', 4, ['tough', 'valid number']),
+    ('unknown choice', '[combined, delete]', '[combined, delet]', 5, ['delet', "'delete'"]),
+    ('end of a range', 'high: 400', 'high: 1e7', 9, ['high', '100000']),
     ('no YAML', 'bags: [bags]', 'bags: [bags', 2, ['not valid YAML']),
 ]
 

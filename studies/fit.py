@@ -1,0 +1,212 @@
+"""Search for the constants under which computed forces are nearest to recorded ones."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import qmc
+
+from cutting_trainer.studies.identification import (
+    Linearised,
+    Prior,
+    deviations,
+    window_means,
+)
+
+Floats = NDArray[np.float64]
+
+DIFFERENCE = 0.1
+"""Step of the central differences of logarithms: cuts go on from element to element."""
+START_POINTS = 3
+"""Points of the start's design for each unknown."""
+MAX_STEPS = 8
+_START_BAGS = 3
+_START_SPREAD = 1.5
+"""Half of the design's range, and _BOUND that of the search, in spreads of the prior."""
+_BOUND = 3.0
+_TOLERANCE = 1e-3
+_FAILED = 10.0
+"""Residual of a point that cannot be computed, in recorded forces."""
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Recorded force of a bag.
+
+    Attributes:
+        times: of the ticks [s], shape (n,).
+        felt: force on the hand [N], shape (n, 3).
+    """
+
+    times: Floats
+    felt: Floats
+
+
+Point = tuple[float, ...]
+"""Values of the unknown constants, in their order and units."""
+Compute = Callable[[Iterable[tuple[int, Point]]], dict[tuple[int, Point], Floats]]
+"""Returns computed forces [N], shape (n, 3), by number of bag and point; NaN where it failed."""
+
+
+class Fit:
+    """Maximum of the posterior, over re-simulations in parallel.
+
+    Args:
+        observations: of the bags.
+        priors: of the unknowns, by name.
+        noise: of the force for one sample of one component [N].
+        compute: re-simulates.
+
+    Attributes:
+        computed: number of re-simulations.
+    """
+
+    def __init__(
+        self,
+        observations: Sequence[Observation],
+        priors: dict[str, Prior],
+        noise: float,
+        compute: Compute,
+    ) -> None:
+        self.computed = 0
+        self._observations, self._priors, self._compute = observations, priors, compute
+        self._deviations = [deviations(o.times, o.felt, noise) for o in observations]
+        self._felt = [window_means(o.times, o.felt) for o in observations]
+        self._mean = np.log([prior.median for prior in priors.values()])
+        self._spread = np.array([prior.spread for prior in priors.values()])
+        self._known: dict[tuple[int, Point], Floats] = {}
+        self._untouched: set[tuple[int, int]] = set()
+        self._scale = 1.0
+
+    def solve(self, recorded: Floats, confidence: float) -> Linearised:
+        """Return the problem linearised around its solution.
+
+        Args:
+            recorded: logarithms of the constants of the scene, shape (p,); NaN: it has none.
+            confidence: of the intervals.
+        """
+        begin = self._start(np.where(np.isfinite(recorded), recorded, self._mean))
+        # Of the prior only the share counts that the fit of the start leaves to it.
+        misfit = np.concatenate(self._residuals(begin))
+        self._scale = float(np.sqrt(np.mean(misfit**2))) or 1.0
+        bound = _BOUND * self._spread
+        found = least_squares(
+            self._objective,
+            begin,
+            jac=self._slope,
+            bounds=(np.minimum(self._mean, begin) - bound, np.maximum(self._mean, begin) + bound),
+            x_scale=self._spread,
+            loss='soft_l1',
+            xtol=_TOLERANCE,
+            ftol=_TOLERANCE,
+            max_nfev=MAX_STEPS,
+        )
+        return Linearised(
+            names=tuple(self._priors),
+            at=found.x,
+            residuals=self._residuals(found.x),
+            jacobians=self._jacobians(found.x),
+            prior_mean=self._mean,
+            prior_spread=self._spread,
+            confidence=confidence,
+        )
+
+    def with_mesh(self, problem: Linearised, refined: Sequence[Floats]) -> Linearised:
+        """Return the problem with the error of the mesh.
+
+        Args:
+            problem: without it.
+            refined: forces of each bag on the refined mesh at the solution [N], each (n, 3).
+        """
+        point = self._point(problem.at)
+        changes = [
+            self._weighted(bag, forces - self._known[bag, point])
+            for bag, forces in enumerate(refined)
+        ]
+        return replace(problem, mesh=changes)
+
+    def forces(self, at: Floats) -> list[Floats]:
+        """Return the computed forces of all bags [N], each of shape (n, 3)."""
+        point = self._point(at)
+        bags = range(len(self._observations))
+        self._need([(bag, point) for bag in bags])
+        return [self._known[bag, point] for bag in bags]
+
+    def _start(self, recorded: Floats) -> Floats:
+        """Return the best point of a Latin hypercube and the recorded values, on a few bags."""
+        unknowns = len(self._mean)
+        design = qmc.LatinHypercube(unknowns, rng=np.random.default_rng(_SEED))
+        samples = 2.0 * design.random(START_POINTS * unknowns) - 1.0
+        points = np.vstack(
+            [recorded, self._mean, self._mean + _START_SPREAD * self._spread * samples]
+        )
+        few = np.linspace(0, len(self._observations) - 1, _START_BAGS).astype(int)
+        bags = sorted(set(few.tolist()))
+        self._need([(bag, self._point(at)) for at in points for bag in bags])
+        costs = [
+            sum(float(np.sum(self._residual(bag, at) ** 2)) for bag in bags)
+            + float(np.sum(((at - self._mean) / self._spread) ** 2))
+            for at in points
+        ]
+        return np.asarray(points[int(np.argmin(costs))])
+
+    def _objective(self, at: Floats) -> Floats:
+        away = (at - self._mean) / self._spread
+        return np.concatenate([*self._residuals(at), away * self._scale]) / self._scale
+
+    def _slope(self, at: Floats) -> Floats:
+        prior = np.diag(self._scale / self._spread)
+        return np.vstack([*(-j for j in self._jacobians(at)), prior]) / self._scale
+
+    def _residuals(self, at: Floats) -> list[Floats]:
+        self.forces(at)
+        return [self._residual(bag, at) for bag in range(len(self._observations))]
+
+    def _residual(self, bag: int, at: Floats) -> Floats:
+        computed, felt = self._known[bag, self._point(at)], self._observations[bag].felt
+        if np.isnan(computed).any():
+            return _FAILED * self._weighted(bag, felt)
+        return self._weighted(bag, felt - computed)
+
+    def _jacobians(self, at: Floats) -> list[Floats]:
+        bags, unknowns = range(len(self._observations)), range(len(at))
+        steps = DIFFERENCE * np.eye(len(at))
+        ends = [(self._point(at + step), self._point(at - step)) for step in steps]
+        touched = [(bag, i) for bag in bags for i in unknowns if (bag, i) not in self._untouched]
+        self._need([(bag, point) for bag, i in touched for point in ends[i]])
+        self.forces(at)
+        slopes = {}
+        for bag, i in touched:
+            up, down = (self._known[bag, point] for point in ends[i])
+            between = self._known[bag, self._point(at)]
+            failed = [bool(np.isnan(end).any()) for end in (up, down)]
+            width = 2.0 * DIFFERENCE if not any(failed) else DIFFERENCE
+            up, down = (between if failed[0] else up), (between if failed[1] else down)
+            slopes[bag, i] = self._weighted(bag, up - down) / width
+            if not any(failed) and np.array_equal(
+                up, down
+            ):  # a hand that does not cut never meets the toughness
+                self._untouched.add((bag, i))
+        return [
+            np.column_stack(
+                [slopes.get((bag, i), np.zeros(self._felt[bag].size)) for i in unknowns]
+            )
+            for bag in bags
+        ]
+
+    def _weighted(self, bag: int, forces: Floats) -> Floats:
+        """Return window means over their deviations, shape (3 windows,); 0 where none is known."""
+        means = window_means(self._observations[bag].times, forces)
+        return np.nan_to_num(means / self._deviations[bag], nan=0.0).ravel()
+
+    def _point(self, at: Floats) -> Point:
+        return tuple(float(f'{value:.6g}') for value in np.exp(at))
+
+    def _need(self, wanted: Iterable[tuple[int, Point]]) -> None:
+        missing = [each for each in dict.fromkeys(wanted) if each not in self._known]
+        if missing:
+            self.computed += len(missing)
+            self._known |= self._compute(missing)

@@ -1,0 +1,304 @@
+"""Material constants from recorded hands and forces: likelihood, uncertainty, identifiability.
+
+The unknowns are logarithms of constants. A residual is the mean of one force component over a
+window, less the computed one, over its standard deviation. That has the noise of the sensor and an
+error of the model in proportion to the force. Their common scale is estimated from the residuals,
+whose correlation in time widens it. The posterior is Gaussian around its maximum (Laplace; MacKay,
+*Information Theory, Inference, and Learning Algorithms*, 2003, chapter 27). A bootstrap over bags,
+one Gauss-Newton step each, checks it: hands differ by more than noise.
+
+The mesh errs, too: a bag computed on the mesh refined once gives the direction in which its forces
+still change. Quadratic convergence would move them by 4/3 of it (Richardson); each bag has a share
+of its own, because the error depends on where the tool meets the elements. It is marginalised.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from cutting_trainer.tissue_sim.material_presets import PRESETS
+
+Floats = NDArray[np.float64]
+
+PARAMETERS = {
+    'youngs_modulus': 'Pa',
+    'stiffening': '-',
+    'toughness': 'J/m^2',
+    'blade_friction': 'N/m',
+    'friction': '-',
+}
+"""Constants of `tissue.material` that can be identified, and their units."""
+MESH_PRIOR = (4.0 / 3.0, 2.0 / 3.0)
+"""Mean and standard deviation of the share of that change: quadratic convergence, and between none
+and linear."""
+WINDOW_S = 0.05
+MODEL_ERROR = 0.1
+"""Error of the model as a share of the force, before its scale is estimated."""
+MIN_BOOTSTRAP_BAGS = 5
+RESAMPLES = 2000
+_MIN_PRESETS = 3
+_MIN_SPREAD = float(np.log(2.0))
+_FREE_SPREAD = float(np.log(10.0)) / 2.0
+"""Standard deviation of the logarithm without presets: 95 % lie within a factor of ten."""
+_UNTOUCHED = 0.9
+"""Share of the prior's width that is left where bags say nothing about a constant."""
+_UNCLEAR = 0.3
+"""Half of an interval, as a logarithm, above which the correlated constant is named."""
+_CORRELATED = 0.9
+_SCALE_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Lognormal prior of a constant.
+
+    Attributes:
+        median: in the unit of the constant.
+        spread: standard deviation of the logarithm.
+        source: origin, in a few words.
+    """
+
+    median: float
+    spread: float
+    source: str
+
+
+def prior_of(name: str, recorded: float) -> Prior:
+    """Return the prior of a constant from the presets, or around its recorded value.
+
+    Args:
+        name: of the constant.
+        recorded: value in the recorded scene.
+    """
+    values = [preset.values[name] for preset in PRESETS.values() if name in preset.values]
+    if len(set(values)) >= _MIN_PRESETS:
+        logs = np.log(values)
+        spread = max(float(logs.std(ddof=1)), _MIN_SPREAD)
+        return Prior(float(np.exp(logs.mean())), spread, f'{len(values)} presets')
+    median = recorded or {'stiffening': 9.2, 'friction': 0.1}.get(name, 1.0)
+    return Prior(median, _FREE_SPREAD, 'the scene, within a factor of ten')
+
+
+def window_means(times: Floats, values: Floats) -> Floats:
+    """Return the means of force components over windows of `WINDOW_S`.
+
+    Args:
+        times: of the ticks [s], shape (n,).
+        values: [N], shape (n, 3).
+
+    Returns:
+        Shape (windows, 3); a window without a tick is left out.
+    """
+    window = np.floor((times - times[0]) / WINDOW_S + 1e-9).astype(int)
+    _, of, count = np.unique(window, return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(of, values[:, i]) / count for i in range(3)], axis=1)
+
+
+def deviations(times: Floats, felt: Floats, noise: float) -> Floats:
+    """Return the standard deviation of each window [N], shape (windows, 3), up to a common scale.
+
+    Args:
+        times: of the ticks [s], shape (n,).
+        felt: recorded force [N], shape (n, 3).
+        noise: of the sensor for one sample of one component [N].
+    """
+    means = window_means(times, felt)
+    samples = max(len(times) / len(means), 1.0)
+    size = np.linalg.norm(means, axis=1, keepdims=True)
+    return np.asarray(np.sqrt(noise**2 / samples + (MODEL_ERROR * size) ** 2) * np.ones(3), float)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Problem around its solution.
+
+    Attributes:
+        names: of the unknown constants.
+        at: their logarithms, shape (p,).
+        residuals: of each bag, each shape (m,); recorded less computed.
+        jacobians: of the computed values, each shape (m, p).
+        prior_mean, prior_spread: shape (p,).
+        confidence: of the intervals.
+        mesh: change of the computed values of each bag by a finer mesh, each shape (m,); (): not
+            known.
+    """
+
+    names: tuple[str, ...]
+    at: Floats
+    residuals: Sequence[Floats]
+    jacobians: Sequence[Floats]
+    prior_mean: Floats
+    prior_spread: Floats
+    confidence: float = 0.95
+    mesh: Sequence[Floats] = ()
+
+    @cached_property
+    def _white(self) -> tuple[list[Floats], list[Floats], float]:
+        """Residuals and Jacobians without the error of the mesh, and the variance of a residual."""
+        raw = list(self.residuals)
+        if self.mesh:
+            raw = [r - MESH_PRIOR[0] * of for r, of in zip(raw, self.mesh, strict=True)]
+        residuals, jacobians, scale = raw, list(self.jacobians), _variance(raw, len(self.names))
+        for _ in range(_SCALE_ROUNDS):
+            if self.mesh:
+                residuals, jacobians = (
+                    [_without(x, change, scale) for x, change in zip(of, self.mesh, strict=True)]
+                    for of in (raw, self.jacobians)
+                )
+            step = self._step(residuals, jacobians, scale)
+            left = [r - j @ step for r, j in zip(residuals, jacobians, strict=True)]
+            scale = _variance(left, len(self.names))
+        return residuals, jacobians, scale
+
+    @property
+    def scale(self) -> float:
+        """Variance of a residual, widened by the correlation of neighbours in time."""
+        return self._white[2]
+
+    @cached_property
+    def information(self) -> Floats:
+        """Information of the bags without the prior, shape (p, p)."""
+        _, jacobians, scale = self._white
+        return np.asarray(sum(j.T @ j for j in jacobians) / scale, float)
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Posterior covariance of the unknowns, shape (p, p)."""
+        return np.asarray(np.linalg.inv(self.information + np.diag(self.prior_spread**-2.0)), float)
+
+    def step(self, weights: Floats | None = None) -> Floats:
+        """Return the Gauss-Newton step to the maximum of the posterior, shape (p,).
+
+        Args:
+            weights: how often each bag counts, shape (bags,); None: once.
+        """
+        return self._step(*self._white, weights)
+
+    def _step(
+        self,
+        residuals: Sequence[Floats],
+        jacobians: Sequence[Floats],
+        scale: float,
+        weights: Floats | None = None,
+    ) -> Floats:
+        counts = np.ones(len(residuals)) if weights is None else weights
+        parts = list(zip(counts, jacobians, residuals, strict=True))
+        matrix = sum(n * (j.T @ j) for n, j, _ in parts) / scale
+        precision = self.prior_spread**-2.0
+        pull = sum(n * (j.T @ r) for n, j, r in parts) / scale
+        pull = pull + precision * (self.prior_mean - self.at)
+        return np.asarray(np.linalg.solve(matrix + np.diag(precision), pull), float)
+
+    def bootstrap_spread(self, seed: int = 0) -> Floats | None:
+        """Return standard deviations over bags drawn with replacement, shape (p,).
+
+        None: there are fewer than `MIN_BOOTSTRAP_BAGS`.
+        """
+        bags = len(self.residuals)
+        if bags < MIN_BOOTSTRAP_BAGS:
+            return None
+        random = np.random.default_rng(seed)
+        draws = random.multinomial(bags, np.full(bags, 1.0 / bags), RESAMPLES)
+        steps = np.array([self.step(draw.astype(float)) for draw in draws])
+        return np.asarray(steps.std(axis=0, ddof=1) * np.sqrt(bags / (bags - 1.0)))
+
+    @cached_property
+    def half_widths(self) -> Floats:
+        """Half of the interval of each unknown: the wider of Laplace and bootstrap, shape (p,)."""
+        tail = 0.5 + self.confidence / 2.0
+        widths = np.sqrt(np.diag(self.covariance)) * student.ppf(tail, 1e6)
+        spread = self.bootstrap_spread()
+        if spread is not None:
+            widths = np.maximum(widths, spread * student.ppf(tail, len(self.residuals) - 1))
+        # Bags that say nothing leave the prior, and no more than that.
+        return np.asarray(np.minimum(widths, self.prior_spread * student.ppf(tail, 1e6)))
+
+    @cached_property
+    def estimates(self) -> Floats:
+        """The unknowns at the maximum of the posterior, shape (p,)."""
+        return self.at + self.step()
+
+
+def _variance(residuals: Sequence[Floats], unknowns: int) -> float:
+    """Return the variance of a residual, widened by the correlation of neighbours in time."""
+    total = sum(float(r @ r) for r in residuals)
+    count = sum(int(np.count_nonzero(r)) for r in residuals)
+    lagged = sum(float(r[3:] @ r[:-3]) for r in residuals)  # three components a window
+    rho = min(max(lagged / total, 0.0), 0.9) if total > 0.0 else 0.0
+    return max(total / max(count - unknowns, 1), 1e-12) * (1.0 + rho) / (1.0 - rho)
+
+
+def _without(values: Floats, change: Floats, scale: float) -> Floats:
+    """Return values, shape (m,) or (m, p), whitened by an error along the change by the mesh."""
+    size = float(change @ change)
+    if size == 0.0:
+        return values
+    taken = 1.0 - 1.0 / np.sqrt(1.0 + MESH_PRIOR[1] ** 2 * size / scale)
+    along = change / np.sqrt(size)
+    return np.asarray(values - taken * np.multiply.outer(along, along @ values), float)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A constant with its interval.
+
+    Attributes:
+        value, low, high: in its unit.
+        laplace, bootstrap: standard deviations of the logarithm; NaN: too few bags.
+        prior: of the constant.
+    """
+
+    value: float
+    low: float
+    high: float
+    laplace: float
+    bootstrap: float
+    prior: Prior
+
+
+def estimates_of(problem: Linearised, priors: Mapping[str, Prior]) -> dict[str, Estimate]:
+    """Return each constant with its interval."""
+    spread = problem.bootstrap_spread()
+    found = {}
+    for i, (name, at) in enumerate(zip(problem.names, problem.estimates, strict=True)):
+        half = problem.half_widths[i]
+        found[name] = Estimate(
+            value=float(np.exp(at)),
+            low=float(np.exp(at - half)),
+            high=float(np.exp(at + half)),
+            laplace=float(np.sqrt(problem.covariance[i, i])),
+            bootstrap=float('nan') if spread is None else float(spread[i]),
+            prior=priors[name],
+        )
+    return found
+
+
+def identifiability(problem: Linearised) -> list[str]:
+    """Return a sentence for each constant that the bags do not determine."""
+    sentences = []
+    spreads = np.sqrt(np.diag(problem.covariance))
+    correlation = problem.covariance / np.outer(spreads, spreads)
+    for i, name in enumerate(problem.names):
+        alone = 1.0 / np.sqrt(problem.information[i, i] + problem.prior_spread[i] ** -2.0)
+        if alone > _UNTOUCHED * problem.prior_spread[i]:
+            sentences.append(
+                f'these bags do not touch {name}: the force hardly changes with it, and its value '
+                'is that of the prior'
+            )
+            continue
+        if problem.half_widths[i] < _UNCLEAR:
+            continue
+        others = np.abs(correlation[i])
+        others[i] = 0.0
+        other = int(others.argmax())
+        sentences.append(
+            f'these bags cannot tell {name} from {problem.names[other]}'
+            if others[other] > _CORRELATED
+            else f'these bags determine {name} poorly, to a factor of '
+            f'{np.exp(problem.half_widths[i]):.2f}'
+        )
+    return sentences
