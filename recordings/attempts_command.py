@@ -3,6 +3,7 @@
 import csv
 import math
 import shutil
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -30,6 +31,8 @@ from cutting_trainer.exercises.score import UNITS, in_words, score
 from cutting_trainer.recordings.html_report import recorded
 from cutting_trainer.session.errors import SessionError
 
+_RECORDED_NOW_S = 5.0
+"""[s] since the last byte of a bag, within which it is being recorded: it grows faster."""
 PASS_SCORE = 70.0
 """Pass line of curves where the scenes do not agree on one."""
 
@@ -179,14 +182,28 @@ def delete(store: AttemptStore, folder: Path, subject: str) -> list[str]:
     """Delete a subject: rows of the index, and the bags in the indexed folder.
 
     Raises:
-        SessionError: the index has no attempt of that subject.
+        SessionError: the index has no attempt of that subject, or one is recorded now.
     """
-    bags = store.delete_subject(subject)
+    bags = [Path(row.bag) for row in store.rows(subject)]
     if not bags:
         raise SessionError(
             f'the index has no attempt of {subject!r}: `attempts` lists the subjects'
         )
-    own = [bag for bag in map(Path, bags) if bag.parent == folder.resolve() and bag.is_dir()]
+    own = [bag for bag in bags if bag.parent == folder.resolve() and bag.is_dir()]
+    if recorded_now := next(filter(_grows, own), None):
+        raise SessionError(f'{recorded_now} is being recorded: end that session first')
+    store.delete_subject(subject)
     for bag in own:
         shutil.rmtree(bag)
     return [str(bag) for bag in own]
+
+
+def _grows(bag: Path) -> bool:
+    """Return whether a bag that is not closed has been written to just now."""
+    try:
+        if open_bag(bag).complete:
+            return False
+    except BagError:
+        return False
+    newest = max(file.stat().st_mtime for file in bag.iterdir())
+    return time.time() - newest < _RECORDED_NOW_S

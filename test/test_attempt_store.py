@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import shutil
 import sqlite3
 from contextlib import closing
@@ -79,6 +80,20 @@ def test_a_deleted_subject_leaves_no_row_no_bag_and_no_byte(tmp_path) -> None:
     assert b'subject-of-mine' not in (tmp_path / STORE_FILE).read_bytes()
     with pytest.raises(SessionError, match='no attempt of'):
         delete(store, tmp_path, 'subject-of-mine')
+
+
+def test_an_attempt_that_is_being_recorded_is_not_deleted(tmp_path) -> None:
+    bag, file = tmp_path / 'now', tmp_path / 'now' / 'straight_cut_0.mcap'
+    shutil.copytree(SAMPLE, bag)
+    file.write_bytes(file.read_bytes()[:-2000])  # no end yet
+    store = open_store(tmp_path)
+    store.put([row(bag, 'subject-of-mine')])
+    with pytest.raises(SessionError, match='now is being recorded: end that session first'):
+        delete(store, tmp_path, 'subject-of-mine')
+    assert bag.exists() and store.rows()
+    for each in bag.iterdir():
+        os.utime(each, (1e9, 1e9))  # its recorder was killed long ago
+    assert delete(store, tmp_path, 'subject-of-mine') == [str(bag)]
 
 
 def test_a_curve_is_the_mean_of_the_last_five_and_knows_when_it_stays_above() -> None:

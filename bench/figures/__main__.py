@@ -76,8 +76,8 @@ SUBJECTS = {
         not_covered={
             1: 'of it: 20 bags, 10 settings and 20 kills take minutes',
             2: 'of it: dask-jobqueue is not tried',
-            3: 'tissue is not identified yet',
-            4: 'there is no export for learning yet',
+            3: 'it takes minutes: `python -m bench.trials.identification`',
+            4: "it needs LeRobot's own loader, in an environment of its own",
             5: 'it needs readers who have not seen the code',
         },
     ),
@@ -91,7 +91,7 @@ SUBJECTS = {
     'training': Subject(
         modules=('training',),
         not_covered={
-            1: 'it needs a browser and the page',
+            1: 'it needs a browser: `./trainer test --all -k test_page_training`',
             2: 'of it: the other four exercises, those who cut everything, and 40 attempts of each '
             'kind: an hour or more by `python -m bench.training -o FILE`',
             3: 'it needs eyes that have not seen the code',
