@@ -1,4 +1,4 @@
-"""Identified materials: the fit on known laws of force, constants that bags do not determine, the command."""
+"""Identified materials: the fit on known laws, constants that no bag determines, the command."""
 
 import json
 import subprocess
