@@ -96,7 +96,7 @@ def write_dataset(
 
     Raises:
         BagError: a bag lacks a stream.
-        SessionError: the folder exists, rates differ, or a file differs from its bag.
+        SessionError: the folder exists, rates differ, or a file read back differs from its bag.
     """
     if output.exists():
         raise SessionError(f'{output} exists already: name a new folder for the data set')

@@ -1,4 +1,4 @@
-"""Identified materials: the fit on known laws of force, and what bags do not determine."""
+"""Identified materials: the fit on known laws, constants that no bag determines, the command."""
 
 import json
 import subprocess
