@@ -69,12 +69,13 @@ class Loop:
     def start(self) -> None:
         self._next = self._clock.now
 
-    def wait(self) -> None:
+    def wait(self) -> int:
         if self._left == 0:
             self._stop.set()
         self._left -= 1
         self._next = max(self._next + PERIOD, self._clock.now)
         self._clock.now = self._next
+        return 0
 
     def report(self) -> dict[str, float]:
         return {}

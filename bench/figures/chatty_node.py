@@ -32,7 +32,7 @@ class Lateness:
     def news(self) -> np.ndarray:
         """Return the lateness [s] of the deadlines since the last call, shape (n,)."""
         loop, ticks = self._loop, self._loop.ticks
-        late = loop._lateness[np.arange(self._seen, ticks) % len(loop._lateness)]
+        late = np.array(loop._lateness)[np.arange(self._seen, ticks) % len(loop._lateness)]
         self._seen = ticks
         missed = np.maximum(late, 0) // loop.period_ns
         behind = np.concatenate([np.arange(count + 1) for count in missed] or [np.zeros(0)])
