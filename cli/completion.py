@@ -10,7 +10,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from cutting_trainer.session.scene_loader import SCENES
+from cutting_trainer.node_common.share_folder import scene_names
 
 Shell = Literal['bash', 'zsh']
 LAUNCHERS_OWN = ('setup', 'overlay', 'clean', 'bench', 'chart', 'validate')
@@ -68,7 +68,7 @@ def script(program: Any, shell: Shell) -> str:
 def _known(name: str, hints: Mapping[str, Any]) -> list[str]:
     """Return values that an option or argument may have, as far as they can be listed."""
     if name == 'scene':
-        return sorted(path.stem for path in SCENES.glob('*.yaml'))
+        return scene_names()
     if typing.get_origin(hints.get(name)) is Literal:
         return list(typing.get_args(hints[name]))
     return []

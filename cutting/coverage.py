@@ -45,8 +45,9 @@ def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple
     outside = np.linalg.norm(along, axis=2).mean(axis=1) > GAP * h
     inside = (found >= 0) & ~np.repeat(outside, count)
     places, areas = places[inside], areas[inside]
-    distance = distances_to_triangles(places, opened.rest, opened.triangles)
     earlier = mesh.triangles[mesh.triangle_kind == CUT]
+    new = opened.triangles.astype(earlier.dtype)
+    distance = distances_to_triangles(places, opened.rest, new)
     closed = np.minimum(distance, distances_to_triangles(places, mesh.rest, earlier)) > _NEAR * h
     area = float(areas[closed].sum())
     if area < _MIN_AREA * h**2:

@@ -121,5 +121,5 @@ def _altitudes(rest, tetrahedra, out):
 def smallest_altitudes(rest: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Return the smallest altitude of each tetrahedron [m], shape (m,)."""
     out = np.empty(len(tetrahedra))
-    _altitudes(rest, tetrahedra, out)
+    _altitudes(rest, np.ascontiguousarray(tetrahedra, np.int64), out)
     return out

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from cutting_trainer.node_common.scene_reader import SceneModel, read_section
-from cutting_trainer.node_common.share_folder import scene_names, share_folder
+from cutting_trainer.node_common.share_folder import SCENES, scene_names
 
 Coordinate = Annotated[float, Field(ge=-2, le=2)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -188,7 +188,7 @@ def exercise_titles() -> dict[str, str]:
     """Return the titles of the exercises that come with the trainer, by scene."""
     titles = {}
     for name in scene_names():
-        scene = share_folder() / 'config' / 'scenes' / f'{name}.yaml'
-        if title := read_section(scene, 'exercise', ExerciseSettings).title:
+        section = read_section(SCENES / f'{name}.yaml', 'exercise', ExerciseSettings)
+        if title := section.title:
             titles[name] = title
     return titles

@@ -29,6 +29,10 @@ def is_checkout() -> bool:
     return share_folder() == PACKAGES
 
 
+SCENES = share_folder() / 'config' / 'scenes'
+"""Folder of the scenes that come with the trainer."""
+
+
 def scene_names() -> list[str]:
     """Return the names of the scenes that come with the trainer."""
-    return sorted(path.stem for path in (share_folder() / 'config' / 'scenes').glob('*.yaml'))
+    return sorted(path.stem for path in SCENES.glob('*.yaml'))

@@ -8,8 +8,8 @@ import itertools
 import json
 import os
 import shutil
+import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -20,8 +20,8 @@ from urllib.request import Request, urlopen
 
 from websockets.sync.client import connect
 
-from cutting_trainer.session import parent_death_signal
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.parent_death_signal import bound
 
 STEP_TIMEOUT_S = 150.0
 """Timeout of any step on a shared machine without a graphics card."""
@@ -144,9 +144,7 @@ def run_browser(kind: type[P], size: tuple[int, int], coarseness: int = 1) -> It
     if CHROMIUM is None:
         raise SessionError('chromium is not installed: sudo apt install chromium')
     with tempfile.TemporaryDirectory(prefix='chromium-', ignore_cleanup_errors=True) as profile:
-        # Bound to this process: the kernel ends both together.
-        command = [sys.executable, '-I', '-S', parent_death_signal.__file__, str(os.getpid()), '9']
-        command += [CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
+        command = [CHROMIUM, '--headless=new', '--no-sandbox', '--remote-debugging-port=0']
         command += [f'--user-data-dir={profile}', '--no-first-run', '--disable-extensions']
         command += ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--mute-audio']
         command += ['--disable-background-networking', '--disable-dev-shm-usage']
@@ -154,7 +152,7 @@ def run_browser(kind: type[P], size: tuple[int, int], coarseness: int = 1) -> It
         command += ['--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1']
         with Path(profile, 'said').open('wb') as said:
             process = subprocess.Popen(
-                command,
+                bound(signal.SIGKILL, *command),
                 stdout=said,
                 stderr=said,
                 start_new_session=True,
@@ -173,5 +171,5 @@ def run_browser(kind: type[P], size: tuple[int, int], coarseness: int = 1) -> It
             for page in browser.pages:
                 page.close()
         finally:
-            os.killpg(process.pid, 9)
+            os.killpg(process.pid, signal.SIGKILL)
             process.wait()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.node_process import BOUND
+from cutting_trainer.session.parent_death_signal import bound
 from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, link
 
 _MAX_ROWS = 100
@@ -34,9 +34,8 @@ class _Program:
 
     def __init__(self, *words: str) -> None:
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  a pipe that nobody reads stops it
-        bound = (*BOUND, str(os.getpid()), str(int(signal.SIGTERM)))
         self._process = subprocess.Popen(
-            [*bound, sys.executable, '-m', 'cutting_trainer.cli', *words],
+            bound(signal.SIGTERM, sys.executable, '-m', 'cutting_trainer.cli', *words),
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.DEVNULL,

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cutting_trainer.node_common.output import HEARTBEAT, Outlet
+from cutting_trainer.session.parent_death_signal import bound
 
 MAX_TAIL_LINES = 6
 MAX_LINE_BYTES = 1 << 16
@@ -21,7 +21,6 @@ MAX_READS = 16
 HEARTBEAT_PERIOD_S = 0.5
 LOG_CLOSE_TIMEOUT_S = 2.0
 """Time [s] that the end of a node waits for the disk to write the last lines of its log."""
-BOUND = (sys.executable, '-I', '-S', str(Path(__file__).with_name('parent_death_signal.py')))
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,7 @@ class NodeProcess:
         beating = {HEARTBEAT: f'{HEARTBEAT_PERIOD_S:g}'} if command.has_heartbeat else {}
         orphaned = signal.SIGTERM if command.records else signal.SIGKILL
         self.process = subprocess.Popen(
-            [*BOUND, str(os.getpid()), str(int(orphaned)), *command.argv],
+            bound(orphaned, *command.argv),
             stdin=subprocess.PIPE
             if command.converses or command.e_stop_arguments
             else subprocess.DEVNULL,

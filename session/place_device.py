@@ -30,8 +30,9 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     check_together,
 )
 from cutting_trainer.node_common.cdr_codec import StampedMessage
+from cutting_trainer.node_common.share_folder import SCENES
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.scene_loader import SCENES, Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import load_tissue
 
 MOVE_TIMEOUT_S = 30.0

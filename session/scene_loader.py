@@ -18,11 +18,9 @@ from cutting_trainer.haptic_bridge.scene_schema import (
 )
 from cutting_trainer.node_common.error_place import nearest
 from cutting_trainer.node_common.scene_reader import SceneModel, read_section, tool_names
-from cutting_trainer.node_common.share_folder import share_folder
+from cutting_trainer.node_common.share_folder import SCENES
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
-
-SCENES = share_folder() / 'config' / 'scenes'
 
 
 class SessionSettings(SceneModel):

@@ -23,9 +23,10 @@ from cutting_trainer.cli.test_command import (
     run_checks,
     verdict,
 )
+from cutting_trainer.node_common.share_folder import SCENES
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
-from cutting_trainer.session.scene_loader import SCENES, find_scene, load_scene
+from cutting_trainer.session.scene_loader import find_scene, load_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -310,10 +310,10 @@ def test_plain_colcon_build_of_a_clone_in_a_workspace_gives_both_packages(
     run(colcon, 'build', *options)
     script = (
         f'from cutting_trainer import {", ".join(ROOMS)}\n'
-        'from cutting_trainer.session import scene_loader\n'
+        'from cutting_trainer.node_common import share_folder\n'
         'from cutting_trainer_msgs.msg import Mesh\n'
         'from cutting_trainer_msgs.srv import Cut\n'
-        'print(tissue_sim.__file__, scene_loader.SCENES, Mesh.CUT, Cut.Request.ADVANCE)\n'
+        'print(tissue_sim.__file__, share_folder.SCENES, Mesh.CUT, Cut.Request.ADVANCE)\n'
     )
     sourced = f'. install/setup.sh && exec {sys.executable} -'
     shell = subprocess.run(

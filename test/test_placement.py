@@ -27,12 +27,13 @@ from cutting_trainer.haptic_bridge.devices.probe_node import DeviceProbe
 from cutting_trainer.haptic_bridge.devices.probe_stream import Poses, ProbeCheck
 from cutting_trainer.haptic_bridge.scene_schema import SettingsError, Transform
 from cutting_trainer.node_common.orientation import from_rpy
+from cutting_trainer.node_common.share_folder import SCENES
 from cutting_trainer.session import probe_command as command
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.place_device import Guide, write_placement
 from cutting_trainer.session.probe_command import Emulation, ProbeOptions, run_probe
-from cutting_trainer.session.scene_loader import SCENES, load_scene
+from cutting_trainer.session.scene_loader import load_scene
 
 ROOT = Path(__file__).parents[1]
 SHEET = np.array([[-0.03, -0.02, 0.0], [0.03, -0.02, 0.0], [0.03, 0.02, 0.0], [-0.03, 0.02, 0.0]])

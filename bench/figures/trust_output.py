@@ -20,7 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 from bench.figures.figure import Figure
 from cutting_trainer.node_common.operating_state import E_STOP, CrtkState, crtk_types
 from cutting_trainer.node_common.qos import EVENTS
-from cutting_trainer.node_common.share_folder import share_folder
+from cutting_trainer.node_common.share_folder import SCENES
 from cutting_trainer.node_common.timing import MAX_TIMELY_LATENESS_S
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.node_commands import ARM_NODE, BRIDGE_NODE, MODULES, node_environment
@@ -154,7 +154,7 @@ def _unread(
     names: Sequence[str], folder: Path, slice_s: float, slices: int, domain: int
 ) -> Iterator[None]:
     """Run nodes whose output goes to unread pipes."""
-    scene = share_folder() / 'config' / 'scenes' / 'block.yaml'
+    scene = SCENES / 'block.yaml'
     processes, readers = [], []
     try:
         for name in names:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.common.clock import Figure, figure
-from cutting_trainer.node_common.share_folder import share_folder
+from cutting_trainer.node_common.share_folder import SCENES
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.node_commands import (
@@ -31,7 +31,7 @@ def start(repeats: int = 5) -> list[Figure]:
     Raises:
         SessionError: a node did not become ready.
     """
-    scene = share_folder() / 'config' / 'scenes' / 'liver.yaml'
+    scene = SCENES / 'liver.yaml'
     times: dict[str, list[float]] = {_REFERENCE: [], **{name: [] for name in MODULES}}
     with reserved_domain('free') as domain, tempfile.TemporaryDirectory() as folder:
         environment, log = node_environment(domain), Path(folder, 'log')

@@ -203,7 +203,7 @@ class TetMesh:
                 mesh is left unchanged in the first case only.
         """
         self._check(delta)
-        removed = np.unique(np.asarray(delta.removed_tetrahedra, np.int64))[::-1]
+        removed = np.unique(np.asarray(delta.removed_tetrahedra, np.int64))[::-1].copy()
         added = np.ascontiguousarray(delta.tetrahedra, np.int64).reshape(-1, 4)
         old_nodes = self.tetrahedra[removed].ravel()
         first_new = self.node_count

@@ -91,7 +91,7 @@ def euler_steps(
         a, b = 3 * spans[s, 0], 3 * spans[s, 1]
         _ahead(q[a:b], u[a:b], v[a:b], beta)
     for step in range(first, first + steps):
-        internal_force(operands, q, f, 1)
+        internal_force(operands, q, f, np.int64(1))
         if faces.at.shape[0] > 0:
             subtract_pulls(faces, f)
         if tools > 0:
@@ -139,7 +139,7 @@ def rk4_steps(
             for s in range(spans.shape[0]):
                 a, b = 3 * spans[s, 0], 3 * spans[s, 1]
                 _ahead(q[a:b], us[a:b], vs[a:b], beta)
-            internal_force(operands, q, f, 1)
+            internal_force(operands, q, f, np.int64(1))
             if faces.at.shape[0] > 0:
                 subtract_pulls(faces, f)
             if tools > 0:
