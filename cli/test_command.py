@@ -1,4 +1,4 @@
-"""The checks of the test command: lint, format, types, tests."""
+"""The checks of the test command: lint, format, tests."""
 
 import subprocess
 import sys
@@ -50,32 +50,30 @@ def require_checkout(folder: Path) -> None:
 def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> list[Check]:
     """Return the checks of a tier, in the order in which they are run.
 
-    Each part of the tests remembers by itself which tests failed, for `--last-failed`. The folders
-    of mypy stand in pyproject.toml.
+    Each part of the tests remembers by itself which tests failed, for `--last-failed`.
 
     Args:
         pytest_arguments: for all parts of the tests: those that may run beside others, on every
             processor; those with a graph, two at a time, as they mostly wait; and those that want
             the machine for themselves.
         temporary: folder for the files of all: the last tests look at what all have made.
-        tier: the quick one has only tests of the first part, and leaves out the types.
+        tier: the quick one has only tests of the first part.
     """
-    python = (sys.executable, '-m')
+    python, by_file = (sys.executable, '-m'), ('--dist=loadfile',)
     checks = [
         Check('ruff check', (*python, 'ruff', 'check', '.')),
         Check('ruff format', (*python, 'ruff', 'format', '--check', '.')),
-        Check('mypy', (*python, 'mypy')),
     ]
     for name, part, more, repetitions in (
-        (TESTS, 'beside', ('--numprocesses=auto', '--dist=loadfile'), 0),
-        (LIVE, 'live', ('--numprocesses=2', '--dist=loadfile'), MAX_REPETITIONS),
+        (TESTS, 'beside', ('--numprocesses=auto', *by_file, '--no-loadscope-reorder'), 0),
+        (LIVE, 'live', ('--numprocesses=2', *by_file), MAX_REPETITIONS),
         (ALONE, 'alone', (), MAX_REPETITIONS),
     ):
         which = (f'--tier={tier}', f'--part={part}', '--last-failed-no-failures=none')
         where = (f'--basetemp={temporary / part}', '-o', f'cache_dir=.pytest_cache/{part}')
         argv = (*python, 'pytest', *which, *where, *more, *pytest_arguments)
         checks.append(Check(name, argv, repetitions))
-    return [check for check in checks if tier != 'quick' or check.name not in ('mypy', LIVE, ALONE)]
+    return [check for check in checks if tier != 'quick' or check.name not in (LIVE, ALONE)]
 
 
 def run_checks(

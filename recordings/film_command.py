@@ -86,9 +86,10 @@ def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
         pictures = _pictures(page, shown, times, options.size, progress)
         part = options.output.with_name(f'{options.output.stem}.part{options.output.suffix}')
         stack.callback(part.unlink, missing_ok=True)
-        _write_gif(part, options.fps, pictures) if part.suffix == '.gif' else _write_video(
-            part, options, pictures
-        )
+        if part.suffix == '.gif':
+            _write_gif(part, options.fps, pictures)
+        else:
+            _write_video(part, options, pictures)
         part.replace(options.output)
     return len(times)
 
@@ -149,5 +150,7 @@ def _write_video(file: Path, options: FilmOptions, pictures: Iterator[Image.Imag
 
 
 def _write_gif(file: Path, fps: int, pictures: Iterator[Image.Image]) -> None:
-    first = next(pictures)
-    first.save(file, save_all=True, append_images=pictures, duration=round(1000 / fps), loop=0)
+    # One palette without dither: what stands still takes no bytes.
+    first = next(pictures).quantize(dither=Image.Dither.NONE)
+    others = (picture.quantize(palette=first, dither=Image.Dither.NONE) for picture in pictures)
+    first.save(file, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)

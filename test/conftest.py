@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -84,8 +85,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Choose tier and part; put those that look at what all others have made behind them."""
-    items.sort(key=lambda item: item.path.name == 'test_every_bag.py')
+    """Choose tier and part; begin with the files that have most of the long tests.
+
+    So no process waits for another at the end. Behind all are those that look at what others made.
+    """
+    long = Counter(item.path for item in items if item.get_closest_marker('long'))
+    items.sort(key=lambda item: (item.path.name == 'test_every_bag.py', -long[item.path]))
     left_out = LEFT_OUT[config.getoption('tier')]
     part = config.getoption('part')
     chosen, others = [], []

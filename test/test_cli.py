@@ -242,7 +242,7 @@ def test_extra_arguments_of_the_test_command_reach_pytest() -> None:
     *others, beside, live, alone = all_checks(
         ['-k', 'patch', '--maxfail=1'], Path('/tmp/x'), 'usual'
     )
-    assert [check.name for check in others] == ['ruff check', 'ruff format', 'mypy']
+    assert [check.name for check in others] == ['ruff check', 'ruff format']
     for tests, part in ((beside, 'beside'), (live, 'live'), (alone, 'alone')):
         assert tests.argv[1:3] == ('-m', 'pytest')
         assert tests.argv[-3:] == ('-k', 'patch', '--maxfail=1')
@@ -251,7 +251,7 @@ def test_extra_arguments_of_the_test_command_reach_pytest() -> None:
     assert not any(a.startswith('--numprocesses') for a in alone.argv)
 
 
-def test_the_quick_tier_needs_no_graph_and_no_types() -> None:
+def test_the_quick_tier_needs_no_graph() -> None:
     checks = all_checks([], Path('/tmp/x'), 'quick')
     assert [check.name for check in checks] == ['ruff check', 'ruff format', TESTS]
     assert verdict({'lint': 0, TESTS: NO_TESTS})[0] == NO_TESTS
