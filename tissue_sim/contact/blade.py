@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cutting_trainer.tissue_sim.contact.anchor import Anchor, anchor_of
 from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
 from cutting_trainer.tissue_sim.contact.edge import (
     WHOLE,
@@ -24,7 +25,7 @@ from cutting_trainer.tissue_sim.contact.edge import (
 from cutting_trainer.tissue_sim.contact.facing import BLADE_HEIGHT, Law
 from cutting_trainer.tissue_sim.contact.fracture import BLADE_THICKNESS, Strips
 from cutting_trainer.tissue_sim.contact.immersion import POINTS, SHARES, Edge, Tissue
-from cutting_trainer.tissue_sim.mesh.locate import NearElements
+from cutting_trainer.tissue_sim.mesh.locate import NearElements, locate_points
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, tetrahedron_volumes
 
 _MIN_AREA = 1e-8
@@ -146,6 +147,8 @@ class Blade:
         )
         self._element = 0.0
         self._back: np.ndarray | None = None
+        self._from: Anchor | None = None
+        self._to: Anchor | None = None
         self._failed = self._set_back = False
         self.paid = self.rubbed = self._swept = 0.0
         self._settle(no_pull())
@@ -177,19 +180,43 @@ class Blade:
         vars(self).update(self.kept())
 
     def carry(self, positions: np.ndarray) -> None:
-        """Move the edge with the tissue (see `carry_edge`).
+        """Move the edge with the tissue (see `carry_edge`), and the last sweep of one that left.
 
         Args:
             positions: nodes now, of the same mesh as at the last `follow` [m], shape (n, 3).
         """
-        if not self._state.spans.any():
-            return
-        device = points_of(self._device)
-        (at, along), rubbed = carry_edge(
-            self._state, self._strips, device, self._moved, positions, self._law
-        )
-        self._cut_tip, self._cut_edge = self._cut_tip + at, self._cut_edge + along
-        self.rubbed += float(rubbed)
+        moved = np.zeros((2, 3))
+        if self._to is not None:
+            moved, self._to = self._to.carried(positions)
+            self._tip, self._edge = self._tip + moved[0], self._edge + moved[1]
+        elif self._state.spans.any():
+            device = points_of(self._device)
+            moved, rubbed = carry_edge(
+                self._state, self._strips, device, self._moved, positions, self._law
+            )
+            self.rubbed += float(rubbed)
+        if self._from is not None:
+            moved, self._from = self._from.carried(positions)
+        self._cut_tip, self._cut_edge = self._cut_tip + moved[0], self._cut_edge + moved[1]
+
+    def tie(self, mesh: TetMesh, near: NearElements, positions: np.ndarray) -> None:
+        """Tie the edge from which the next sweep starts to the tissue: sweeps join in it.
+
+        Args:
+            mesh: the tissue.
+            near: its tetrahedra.
+            positions: nodes now [m], shape (n, 3).
+        """
+        points = points_of(np.array([self._cut_tip + self._cut_edge, self._cut_tip]))
+        among = near.find(positions, points.min(axis=0), points.max(axis=0))
+        found, weights = np.empty(POINTS, np.int64), np.empty((POINTS, 4))
+        tets, hint = mesh.tetrahedra, self._state.hint[0]
+        locate_points(positions, tets, mesh.neighbors, among, points, hint, found, weights)
+        inside = found >= 0
+        self._from = None
+        if inside.any():
+            corners = tets[found[inside]].astype(np.int64)
+            self._from = Anchor(corners, weights[inside], points[inside], SHARES[inside])
 
     def follow(
         self,
@@ -218,6 +245,7 @@ class Blade:
             some = mesh.tetrahedra[:: 1 + len(mesh.tetrahedra) // _MEDIAN_SAMPLES]
             volumes = tetrahedron_volumes(mesh.rest, some)
             self._element = 2 * float(np.cbrt(np.median(volumes)))
+        before, anchor = self._device, anchor_of(self._state)
         self._device, self._moved = device.copy(), points_of(moved)
         self._law = self._law._replace(stiffness=stiffness / WHOLE, facing=facing)
         points, edge = points_of(device), self._state.points
@@ -230,7 +258,40 @@ class Blade:
             positions, mesh.rest, mesh.tetrahedra, mesh.neighbors, among, opened, mesh.regions
         )
         pull = follow_device(self._state, self._strips, points, self._moved, tissue, self._law)
+        if self._to is not None and self._state.spans.any():
+            self._come_back(before)
         self._settle(pull)
+        if anchor is not None and not self._state.spans.any():
+            self._leave(anchor)
+
+    def leave(self) -> None:
+        """Take the blade out of the tissue where it is; its last sweep can be asked for."""
+        self._leave(anchor_of(self._state))
+        self._state.spans[:] = 0.0
+
+    def _leave(self, anchor: Anchor | None) -> None:
+        """Keep the sweep of an edge that leaves the tissue, and let it go with the tissue.
+
+        Args:
+            anchor: of the edge before; None: it has left already.
+        """
+        if self._swept <= _MIN_AREA and not self._failed:
+            self._cut_tip, self._cut_edge = self._tip.copy(), self._edge.copy()
+            self._from = None
+        self._to = self._to if anchor is None else anchor
+
+    def _come_back(self, before: np.ndarray) -> None:
+        """Go on from the device's edge before [m], shape (2, 3), unless a sweep is kept."""
+        self._to = None
+        if self.sweep() is None:
+            self._cut_tip, self._cut_edge = before[1], before[0] - before[1]
+            self._from = None
+
+    def untie(self) -> None:
+        """Let the last sweep of an edge that has left stay where it is: the mesh has changed."""
+        self._from = None
+        if self._to is not None:
+            self._to = self._to.loose()
 
     def let_go(self) -> None:
         """Let the edge follow the device without force: nothing is known of the tool."""
@@ -280,8 +341,9 @@ class Blade:
     def _settle(self, pull: Pull) -> None:
         """Update the output, and the edge as a line."""
         root, tip = self._device
-        self._tip = tip - pull.line[0]
-        self._edge = root - tip - pull.line[1]
+        if self._to is None:
+            self._tip = tip - pull.line[0]
+            self._edge = root - tip - pull.line[1]
         self.force = pull.force
         spans = self._state.spans
         shares = spans / spans.sum() if spans.any() else spans
@@ -294,6 +356,7 @@ class Blade:
         if pull.held and self._swept <= _MIN_AREA and not self._failed:
             # Spine or flat have carried the tissue along: nothing is to be opened.
             self._cut_tip, self._cut_edge = self._tip.copy(), self._edge.copy()
+            self._from = anchor_of(self._state)
         length = float(np.linalg.norm(root - tip)) / POINTS
         self.immersed = length * float(spans.sum())
 
@@ -306,11 +369,11 @@ class Blade:
 
     def confirm_sweep(self) -> None:
         """Start the next sweep from the present edge."""
-        self._swept = 0.0
+        self._swept, self._from = 0.0, None
         self._before = (self._cut_tip - self._tip, self._cut_edge, self._back)
         self._cut_tip = self._tip.copy()
         self._cut_edge = self._edge.copy()
-        behind = self._strips.behind(self._element)
+        behind = self._strips.behind(self._element) if self._to is None else None
         self._back = None if behind is None else behind - self._cut_tip
         self._set_back &= self._failed
         self._failed = False
@@ -322,6 +385,7 @@ class Blade:
         The cutting service may have lost the stroke, and with it the element around the edge, which
         is divided only after the edge has left it. Repeated failures extend the sweep only once.
         """
+        self._from = None
         offset, self._cut_edge, self._back = self._before
         self._cut_tip = self._cut_tip + offset
         if self._back is not None and not self._set_back:

@@ -38,6 +38,7 @@ from cutting_trainer.tissue_sim.contact.immersion import (
     immerse,
     lag_behind,
     rest_length,
+    shares_inside,
 )
 
 WHOLE = POINTS / 2
@@ -112,17 +113,23 @@ def follow_device(edge, strips, device, moved, tissue, law):
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
     fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
     blade = Held(direction, facing, piece, np.zeros(POINTS))
-    points, places = edge.points, edge.points
+    costs, shares, places = np.empty((POINTS, 3)), np.empty(POINTS), edge.points
     for _ in range(_MAX_SLIPS):
         if law.crack > 0.0:
-            points, places = edge.points.copy(), places_at_rest(edge, tissue)
-        limit, cut, rub, area = _slip(edge, strips, device, faces, blade, law, fresh, limits)
-        if limit < 0.0:
-            immerse(edge, device, tissue)
-            if law.crack > 0.0:
-                cut *= note_run(edge, points, places, tissue, fresh)
-        paid, rubbed, swept = paid + cut, rubbed + rub, swept + area
-        if limit >= 0.0 or not edge.spans.any():
+            places = places_at_rest(edge, tissue)
+        points, spans = edge.points.copy(), edge.spans.copy()
+        limit = _slip(edge, strips, device, faces, blade, law, fresh, limits, costs)
+        if limit >= 0.0:
+            break
+        after = edge.points.copy()
+        immerse(edge, device, tissue)
+        shares_inside(edge, tissue, points, after, spans, shares)
+        cut = (shares * costs[:, 0]).sum()
+        if law.crack > 0.0:
+            cut *= note_run(edge, points, places, tissue, fresh)
+        paid, rubbed = paid + cut, rubbed + (shares * costs[:, 1]).sum()
+        swept += (shares * costs[:, 2]).sum()
+        if not edge.spans.any():
             break
     ways, arms = device - edge.points, SHARES * (POINTS * piece)
     middle = (edge.spans * arms).sum() / max(edge.spans.sum(), TINY)
@@ -285,7 +292,7 @@ def _knots(edge, device):
 
 
 @inner
-def _slip(edge, strips, device, faces, blade, law, fresh, limits):
+def _slip(edge, strips, device, faces, blade, law, fresh, limits, costs):
     """Let the points slip whose springs exceed the resistance.
 
     Args:
@@ -293,10 +300,11 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits):
         strips: `Strips`, changed.
         device: points of the device's edge [m], shape (POINTS, 3).
         faces, blade, law, fresh, limits: see `_resist`; before the slip.
+        costs: output where a point slipped, for each: the work of cutting and that of friction [J],
+            the uncut area that was swept [m^2], shape (POINTS, 3).
 
     Returns:
-        The largest force that the edge transmits as it is pulled [N], -1 where a point slipped;
-        the work of cutting and that of friction [J]; the uncut area that was swept [m^2].
+        The largest force that the edge transmits as it is pulled [N], -1 where a point slipped.
     """
     slid, ways = np.zeros(POINTS), device - edge.points
     _resist(edge, ways, faces, blade, law, fresh, limits)
@@ -314,24 +322,25 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits):
         ways[i] *= slid[i] / size
         cutting = cutting or (fresh[i] and slid[i] > SETTLED)
     if slid.max() < SETTLED:
-        return limits.sum(), 0.0, 0.0, 0.0
+        return limits.sum()
     if law.crack > 0.0:
         bound_run(edge, slid, ways, fresh)
     knots = _knots(edge, device)
-    work, rub, area = 0.0, 0.0, 0.0
+    costs[:] = 0.0
     for i in range(POINTS):
         if edge.spans[i] > 0.0:
-            work += limits[i] * slid[i]
-            rub += law.friction[edge.region[i]] * blade.piece * edge.spans[i] * slid[i]
+            rub = law.friction[edge.region[i]] * blade.piece * edge.spans[i] * slid[i]
+            costs[i, 0], costs[i, 1] = limits[i] * slid[i] - rub, rub
             edge.points[i] += ways[i]
             if fresh[i]:
-                area += blade.piece * edge.spans[i] * _split(ways[i], blade.direction)[1]
+                area = blade.piece * edge.spans[i] * _split(ways[i], blade.direction)[1]
+                costs[i, 2] = area
     lag_behind(edge, device)
     if cutting:
         add_strip(strips, knots, _knots(edge, device))
     else:
         strips.counts[1] = 0
-    return -1.0, work - rub, rub, area
+    return -1.0
 
 
 @inner

@@ -96,6 +96,36 @@ def immerse(edge, device, tissue):
 
 
 @inner
+def shares_inside(edge, tissue, before, after, spans, shares):
+    """Find which share of its slip each point has made in the tissue.
+
+    Args:
+        edge: `Edge` after the slip and `immerse`.
+        tissue: `Tissue`.
+        before, after: ends of the slips [m], shape (POINTS, 3).
+        spans: `Edge.spans` before, shape (POINTS,).
+        shares: output, 1 but for points that have left the tissue, shape (POINTS,).
+    """
+    way, found, weights = np.empty((_TESTS, 3)), np.empty(_TESTS, np.int64), np.empty((_TESTS, 4))
+    for i in range(POINTS):
+        shares[i] = 1.0
+        stays = edge.spans[i] > 0.0
+        for c in range(3):
+            stays = stays and edge.points[i, c] == after[i, c]
+        if stays or spans[i] == 0.0:
+            continue
+        for k in range(_TESTS):
+            part = (k + 1) / _TESTS
+            for c in range(3):
+                way[k, c] = (1.0 - part) * before[i, c] + part * after[i, c]
+        _locate(tissue, way, edge.hint[0], found, weights)
+        reached = 0
+        while reached < _TESTS and found[reached] >= 0:
+            reached += 1
+        shares[i] = min((reached + 0.5) / _TESTS, 1.0)
+
+
+@inner
 def rest_length(edge, tissue):
     """Return the length at rest over that now, of the part of the edge in the tissue.
 

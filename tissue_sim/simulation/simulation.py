@@ -69,6 +69,7 @@ class TissueSimulation:
         self.tools = [ToolState(self.dynamics, resistance, contact, friction) for _ in range(tools)]
         self._outstanding: CutCommand | None = None
         self._finish_due = False
+        self._left: Blade | None = None
         if any(stretch):
             self.dynamics.stretch(np.array(stretch))
 
@@ -149,6 +150,8 @@ class TissueSimulation:
             tool.end(contact, begun, jumped=bool(jump))
             for tool, contact, begun, jump in zip(self.tools, given, in_frame, jumps, strict=True)
         ]
+        if self._left is not None:
+            self._left.carry(self.positions)
         frames = [
             self._frame_of(number, contact, motion, couplings, jump)
             for number, (contact, jump) in enumerate(zip(given, jumps, strict=True))
@@ -160,9 +163,11 @@ class TissueSimulation:
         """Return whether a blade may go in.
 
         One at a time is in the tissue: a stroke of the cutting service has one blade. A second one
-        presses on the surface until the first is out.
+        presses on the surface until the first is out and its stroke has ended.
         """
-        return self.blade is None and all(tool.blade is None for tool in acting)
+        return (
+            self._left is None and self.blade is None and all(tool.blade is None for tool in acting)
+        )
 
     def _frame_of(
         self,
@@ -192,9 +197,11 @@ class TissueSimulation:
             concession=self.dynamics.concession,
         )
         if motion.diverged or jump:
-            self._finish_due |= tool.release()
+            self._finish_due |= tool.release() is not None
             return replace(frame, state=tool.state)
-        self._finish_due |= tool.update(contact, coupling)
+        if (left := tool.update(contact, coupling)) is not None:
+            left.leave()
+            self._left, self._finish_due = left, True
         others = held_nodes(couplings[:number] + couplings[number + 1 :])
         alone = not np.isin(others, coupling.nodes).any()
         force = tool.reaction(motion, coupling, alone=alone)
@@ -212,16 +219,19 @@ class TissueSimulation:
         """Return what the cutting service is asked for; a stroke ends before the next begins."""
         if self._outstanding is not None:
             return None, None
-        if self._finish_due:
-            self._finish_due, self._outstanding = False, CutCommand.FINISH
-            return CutCommand.FINISH, None
-        blade = self.blade
+        blade = self._sweeping
         sweep = None if blade is None else blade.sweep()
-        if blade is None or sweep is None:
-            return None, None
-        blade.confirm_sweep()
-        self._outstanding = CutCommand.ADVANCE
-        return CutCommand.ADVANCE, sweep
+        if blade is not None and sweep is not None:
+            blade.confirm_sweep()
+            self._outstanding = CutCommand.ADVANCE
+        elif self._finish_due:
+            self._left, self._finish_due, self._outstanding = None, False, CutCommand.FINISH
+        return self._outstanding, sweep
+
+    @property
+    def _sweeping(self) -> Blade | None:
+        """The blade of the stroke: the one that has left, until the stroke ends."""
+        return self._left if self._finish_due else self.blade
 
     def apply_cut(self, delta: TopologyDelta) -> Touched:
         """Apply a change of connectivity; displacement and velocity are interpolated.
@@ -240,6 +250,8 @@ class TissueSimulation:
         touched = self.dynamics.apply_cut(delta)
         for tool in self.tools:
             tool.apply_cut(count, delta, touched)
+        if self._left is not None:
+            self._left.untie()
         self._outstanding = None
         self.elements_cut += len(delta.removed_tetrahedra)
         return touched
@@ -253,5 +265,5 @@ class TissueSimulation:
         failed, self._outstanding = self._outstanding, None
         if failed == CutCommand.FINISH:
             self._finish_due = True
-        elif failed == CutCommand.ADVANCE and self.blade is not None:
-            self.blade.retry_sweep()
+        elif failed == CutCommand.ADVANCE and (blade := self._sweeping) is not None:
+            blade.retry_sweep()

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact import (
+    anchor,
     blade,
     coupling,
     cut_contact,
@@ -63,6 +64,7 @@ from cutting_trainer.tissue_sim.simulation.state_checks import check_simulation,
 _MODULES = (
     active_region,
     adaptive_law,
+    anchor,
     blade,
     coarse_grid,
     coarse_rows,

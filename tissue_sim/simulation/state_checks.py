@@ -162,6 +162,8 @@ def check_simulation(simulation: TissueSimulation) -> None:
         raise StateError('it has no tool')
     for tool in simulation.tools:
         _check_tool(tool, dynamics, n)
+    if simulation._left is not None:
+        _check_blade(simulation._left, n)
 
 
 def _check_loads(dynamics: Any, n: int) -> None:
@@ -435,6 +437,13 @@ def _check_blade(blade: Any, n: int) -> None:
     has_room('strips of the blade', strips.knots, MAX_STRIPS, 2, KNOTS, 3)
     has_room('counts of the strips', strips.counts, 2)
     within('the number of strips', strips.counts, MAX_STRIPS + 1)
+    for name in ('_from', '_to'):
+        if (anchor := getattr(blade, name)) is not None:
+            count = len(anchor.shares)
+            within(f'corners of {name}', anchor.corners, n)
+            has_room(f'corners of {name}', anchor.corners, count, 4)
+            has_room(f'weights of {name}', anchor.weights, count, 4)
+            has_room(f'points of {name}', anchor.points, count, 3)
     has_room('_device', blade._device, 2, 3)
     has_room('_moved', blade._moved, POINTS, 3)
     for name in ('_tip', '_edge', '_cut_tip', '_cut_edge', 'force'):

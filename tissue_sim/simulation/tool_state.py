@@ -170,8 +170,8 @@ class ToolState:
         self._springs.end_frame(coupling, self._dynamics.displacement, pressed)
         return coupling
 
-    def update(self, contact: ToolContact | None, coupling: Coupling) -> bool:
-        """Update the state of the contact; return whether the blade has just left.
+    def update(self, contact: ToolContact | None, coupling: Coupling) -> Blade | None:
+        """Update the state of the contact; return the blade that has just left, or None.
 
         Args:
             contact: at the end of the frame.
@@ -184,19 +184,18 @@ class ToolState:
                 self._close(contact, coupling)
             if self._grip is not None:
                 self.state = ContactState.INSIDE
-            return False
+            return None
         self.state = ContactState.INSIDE
         if contact is None or not (contact.state == ContactState.NONE or self._clear(contact)):
-            return False
+            return None
         return self.release()
 
-    def release(self) -> bool:
-        """Take the tool out of the tissue; return whether its blade was in it."""
-        was_inside = self.blade is not None
-        self.blade = self._grip = None
+    def release(self) -> Blade | None:
+        """Take the tool out of the tissue; return its blade, if that was in it."""
+        blade, self.blade, self._grip = self.blade, None, None
         self._target = None
         self.state = ContactState.NONE
-        return was_inside
+        return blade
 
     def reaction(self, motion: FrameMotion, coupling: Coupling, *, alone: bool) -> np.ndarray:
         """Return the force of the tissue on the tool [N], shape (3,).
@@ -246,6 +245,8 @@ class ToolState:
     def apply_cut(self, count: int, delta: TopologyDelta, touched: Touched) -> None:
         """Follow a change of connectivity; arguments as of `ToolSprings.apply_cut`."""
         self._springs.apply_cut(count, delta, touched)
+        if self.blade is not None:
+            self.blade.untie()
         if self._grip is not None:
             nodes = self._grip.nodes.copy()
             for target, source in touched.renumbered:

@@ -102,6 +102,8 @@ class ToolInFrame:
         self._near = NearElements(mesh.tetrahedra)
         self._opened = mesh.triangles[mesh.triangle_kind == CUT]
         self._positions = positions
+        if blade is not None:
+            blade.tie(mesh, self._near, positions)
         self._kept = None if blade is None else (blade, blade.kept())
         self.parts = max(int(np.ceil(frame_time / _PERIOD_S - 1e-9)), 1)
         self.blade = blade
