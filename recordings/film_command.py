@@ -86,9 +86,10 @@ def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
         pictures = _pictures(page, shown, times, options.size, progress)
         part = options.output.with_name(f'{options.output.stem}.part{options.output.suffix}')
         stack.callback(part.unlink, missing_ok=True)
-        _write_gif(part, options.fps, pictures) if part.suffix == '.gif' else _write_video(
-            part, options, pictures
-        )
+        if part.suffix == '.gif':
+            _write_gif(part, options.fps, pictures)
+        else:
+            _write_video(part, options, pictures)
         part.replace(options.output)
     return len(times)
 

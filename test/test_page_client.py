@@ -475,6 +475,19 @@ def test_exercise_is_begun_for_a_subject_and_two_attempts_are_opened_side_by_sid
         assert page.wait(lambda: page.evaluate(link), 'the link').endswith('&replay')
 
 
+def test_exercises_on_offer_are_those_of_the_newest_list(browser: Browser) -> None:
+    shown = "[...document.querySelectorAll('#exercise option')].map(option => option.text)"
+    offers = [{'name': name, 'title': name.upper()} for name in ('circle', 'pad')]
+    with opened(browser, StandIn(hello={'exercises': offers})) as page:
+        page.wait(lambda: page.evaluate(shown) == ['CIRCLE', 'PAD'], 'two exercises')
+        fewer = "{exercises: [{name: 'circle', title: 'CIRCLE'}]}"
+        page.evaluate(
+            "import('./static/training.js')"
+            f'.then(({{Training}}) => Training.prototype.begin.call(null, {fewer}))'
+        )
+        assert page.evaluate(shown) == ['CIRCLE']
+
+
 def test_page_without_an_exercise_shows_none(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:

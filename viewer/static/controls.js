@@ -1,5 +1,7 @@
 // The controls of a live session: buttons, choices, the state, the table of nodes.
 
+import { fill } from './fill.js';
+
 const STATES = {
   ENABLED: ['▶', 'FORCE ON'], PAUSED: ['❚❚', 'PAUSED'], DISABLED: ['○', 'FORCE OFF'], FAULT: ['▲', 'FAULT'],
 };
@@ -8,14 +10,6 @@ const SCALE_MS = 100;
 const CONTACTS = ['free', 'touching', 'inside'];
 
 const $ = (id) => document.getElementById(id);
-
-function fill(select, values) {
-  const known = [...select.options].map((option) => option.value);
-  if (known.length === values.length && known.every((value, i) => value === values[i])) return;
-  const chosen = select.value;
-  select.replaceChildren(...values.map((value) => new Option(value, value)));
-  if (values.includes(chosen)) select.value = chosen;
-}
 
 export class Controls {
   /** @param {function} send sends a message of the page */
