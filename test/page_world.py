@@ -83,6 +83,7 @@ class StandIn:
         self.tip = np.array([*positions.mean(axis=0)[:2], positions[:, 2].max() + 0.02])
         self.goal = self.tip.copy()
         self.state, self.e_stopped, self.recording = 'DISABLED', False, ''
+        self.clutched = False
         self._mode, self._says = mode, says
         self._controls: Any = LiveControls(
             scenes=('block', scene),
@@ -222,6 +223,7 @@ class StandIn:
             depth=depth,
             can_guide=self.state == 'ENABLED',
             contact=int(depth > 0),
+            clutched=self.clutched,
             further=[],
         )
         for source in self._sources[: 1 if self._mode == 'live' else 2]:

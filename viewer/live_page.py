@@ -319,6 +319,7 @@ def put_moment(
         depth=depth,
         can_guide=can_guide,
         contact=moment.contact,
+        clutched=moment.clutched,
         further=list(further),
     )
 
