@@ -103,7 +103,7 @@ class StandIn:
         self._ends = threading.Event()
         self.stands_still = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
-        self._hello()
+        self.greet()
         self._thread.start()
 
     def stop(self) -> None:
@@ -139,7 +139,8 @@ class StandIn:
         strip = (np.abs(y + 0.2 * x) < 0.0016) & (np.abs(x) < 0.02) & (z > 0)
         self._tissue.triangle_kind[strip] = CUT
 
-    def _hello(self) -> None:
+    def greet(self, **changed: Any) -> None:
+        """Sends the first message of a session, with changes."""
         live = self._mode == 'live'
         tissues = [shown_tissue('tissue', '' if live else 'recorded')]
         seen = self.positions
@@ -168,7 +169,7 @@ class StandIn:
             'plots_span': 15.0 if live else 20.0,
             'exercise': shown_exercise(self._scene.exercise),
         }
-        self.server.put('hello', **(content | self._says.get('hello', {})))
+        self.server.put('hello', **(content | self._says.get('hello', {}) | changed))
 
     def _act(self, message: AnyMessage) -> None:
         self.asked.append(message)

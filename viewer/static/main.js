@@ -109,7 +109,7 @@ function begin(hello) {
   stop.active = live;
   timeline.active = !live;
   connection.expects = live;
-  $('title').textContent = hello.title;
+  if (!live || other) $('title').textContent = live ? '' : hello.title; // a session says its scene
   if (other) {
     plots.clear();
     plots = new Plots($('plots'), live ? null : (time) => timeline.seek(time));
