@@ -109,13 +109,18 @@ class Attempt:
 
     @property
     def over(self) -> bool:
-        """Whether the tip touched tissue and is back at the end."""
-        return self._is_back() is True
+        """Whether the tip touched tissue and is back at the end, or the time limit is over."""
+        return self._is_back() is True or self._late
 
     @property
     def broken_off(self) -> bool:
-        """Whether the tip touched tissue and was not back at the end when the samples ended."""
-        return self._is_back() is False
+        """Whether the tip touched tissue, and the samples ended before the attempt was over."""
+        return self._is_back() is False and not self._late
+
+    @property
+    def _late(self) -> bool:
+        motion, _ = self._during()
+        return len(motion) > 0 and bool(np.ptp(motion[:, 0]) > self.exercise.time_limit)
 
     def _is_back(self) -> bool | None:
         """Return whether the tip is back at the end; None: no end, or nothing was touched."""
@@ -140,13 +145,16 @@ class Attempt:
         if exercise.start:
             off = np.linalg.norm(motion[:, 1:4] - exercise.start.centre, axis=1)
             started = off > exercise.start.radius
-        if not started.any():
+        waited = motion[:, 0] - motion[0, 0] > exercise.time_limit
+        if not (started | waited).any():
             return motion[:0], forces[:0]
-        first = int(started.argmax())
-        last = len(motion) - 1
-        touched = np.flatnonzero(motion[:, 10] > 0)
+        # Who does not begin within the limit has used it up.
+        first = 0 if waited[started.argmax()] or not started.any() else int(started.argmax())
+        late = motion[:, 0] - motion[first, 0] > exercise.time_limit
+        last = int(late.argmax()) if late.any() else len(motion) - 1
+        touched = np.flatnonzero(motion[: last + 1, 10] > 0)
         if exercise.end and len(touched):
-            back = self._back(motion, touched[-1])
+            back = self._back(motion[: last + 1], touched[-1])
             last = last if back is None else back
         motion = motion[first : last + 1]
         within = (forces[:, 0] >= motion[0, 0]) & (forces[:, 0] <= motion[-1, 0])

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -234,9 +235,10 @@ class _Session:
         """Serve the requests since the last call."""
         while self._asked:
             request = self._asked.pop(0)
-            self._answer(supervisor, problem=self._try(lambda: self._do(request, supervisor)))  # noqa: B023
+            problem = self._try(partial(self._do, request, supervisor))
+            self._answer(supervisor, problem=problem)
         for tell in (self._tell_attempts, self._tell_replay):
-            if problem := self._try(lambda: tell(supervisor)):  # noqa: B023
+            if problem := self._try(partial(tell, supervisor)):
                 self._answer(supervisor, problem=problem)
 
     def _try(self, job: Callable[[], None]) -> str:

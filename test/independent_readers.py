@@ -1,7 +1,7 @@
 """Our bags in the hands of two readers that share no code with us: `rosbags`, and `@mcap/core`, the
 MCAP project's own reader under Node.
 
-Node's packages are pinned in test/mcap_core/package-lock.json and installed into .trainer/ once.
+Node's packages are pinned in package-lock.json of test/mcap_core and installed into .trainer/ once.
 """
 
 import hashlib
@@ -21,20 +21,24 @@ from rosbags.highlevel import AnyReader
 from cutting_trainer.bags.reader import mcap_file, open_bag
 
 ROOT = Path(__file__).parents[1]
-SOURCE = ROOT / 'test' / 'mcap_core'
 LOG_TIME, REST = struct.Struct('<Q'), struct.Struct('<QI')
 
 
-@cache
 def mcap_core() -> Path:
     """The installed script; skips the test, with the reason, where there is none."""
+    return installed('mcap_core') / 'read_bag.mjs'
+
+
+@cache
+def installed(name: str) -> Path:
+    """Where the packages of a folder of test/ are; skips the test where there are none."""
     if not (shutil.which('node') and shutil.which('npm')):
-        pytest.skip('node and npm are not installed: @mcap/core cannot read the bags')
-    home = ROOT / '.trainer' / 'mcap_core'
-    lock = (SOURCE / 'package-lock.json').read_bytes()
+        pytest.skip(f'node and npm are not installed: there is no {name}')
+    source, home = ROOT / 'test' / name, ROOT / '.trainer' / name
+    lock = (source / 'package-lock.json').read_bytes()
     marker = home / 'installed-lock.json'
     home.mkdir(parents=True, exist_ok=True)
-    for file in SOURCE.iterdir():
+    for file in source.iterdir():
         if file.is_file():
             shutil.copy(file, home)
     if not marker.is_file() or marker.read_bytes() != lock:
@@ -42,11 +46,11 @@ def mcap_core() -> Path:
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
         except subprocess.TimeoutExpired:
-            pytest.skip('npm gets no packages within 60 s: @mcap/core cannot read the bags')
+            pytest.skip(f'npm gets no packages within 60 s: there is no {name}')
         if done.returncode:
             pytest.skip(f'npm gets no packages: {done.stderr.strip().splitlines()[-1:]}')
         marker.write_bytes(lock)
-    return home / 'read_bag.mjs'
+    return home
 
 
 Topics = dict[str, dict[str, Any]]

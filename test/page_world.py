@@ -83,6 +83,7 @@ class StandIn:
         self.tip = np.array([*positions.mean(axis=0)[:2], positions[:, 2].max() + 0.02])
         self.goal = self.tip.copy()
         self.state, self.e_stopped, self.recording = 'DISABLED', False, ''
+        self.clutched = False
         self._mode, self._says = mode, says
         self._controls: Any = LiveControls(
             scenes=('block', scene),
@@ -102,7 +103,7 @@ class StandIn:
         self._ends = threading.Event()
         self.stands_still = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
-        self._hello()
+        self.greet()
         self._thread.start()
 
     def stop(self) -> None:
@@ -138,7 +139,8 @@ class StandIn:
         strip = (np.abs(y + 0.2 * x) < 0.0016) & (np.abs(x) < 0.02) & (z > 0)
         self._tissue.triangle_kind[strip] = CUT
 
-    def _hello(self) -> None:
+    def greet(self, **changed: Any) -> None:
+        """Sends the first message of a session, with changes."""
         live = self._mode == 'live'
         tissues = [shown_tissue('tissue', '' if live else 'recorded')]
         seen = self.positions
@@ -167,7 +169,7 @@ class StandIn:
             'plots_span': 15.0 if live else 20.0,
             'exercise': shown_exercise(self._scene.exercise),
         }
-        self.server.put('hello', **(content | self._says.get('hello', {})))
+        self.server.put('hello', **(content | self._says.get('hello', {}) | changed))
 
     def _act(self, message: AnyMessage) -> None:
         self.asked.append(message)
@@ -222,6 +224,7 @@ class StandIn:
             depth=depth,
             can_guide=self.state == 'ENABLED',
             contact=int(depth > 0),
+            clutched=self.clutched,
             further=[],
         )
         for source in self._sources[: 1 if self._mode == 'live' else 2]:

@@ -248,6 +248,29 @@ def test_an_attempt_is_broken_off_until_the_tip_is_back_at_its_end() -> None:
     assert not attempt.broken_off
 
 
+@pytest.mark.parametrize('does', ['nothing', 'moves', 'touches', 'begins late'])
+def test_an_attempt_ends_with_its_time_limit_and_fails(does: str) -> None:
+    end = BallSettings(name='end', centre=(0, 0, 0.05), radius=0.005)
+    task = exercise().model_copy(update={'end': end})
+    attempt = Attempt(task)
+    motion = np.zeros((500, 11))
+    motion[:, 0] = np.arange(500) / 10.0
+    if does in ('moves', 'touches'):
+        motion[50:, 1] = 0.02
+    if does == 'touches':
+        motion[100:, 10] = 1
+    if does == 'begins late':
+        motion[400:, 1] = 0.02
+    attempt.add_motion(motion[:300])
+    assert not attempt.over  # after 30 s, the limit
+    attempt.add_motion(motion[300:])
+    assert attempt.over and not attempt.broken_off
+    measures = attempt.measures()
+    assert measures['time'] == pytest.approx(30.1)
+    got = score(task, measures)
+    assert not got.passed and any('the limit is 30 s' in reason for reason in got.reasons)
+
+
 def test_measures_do_not_depend_on_how_samples_were_batched() -> None:
     random = np.random.default_rng(4)
     motion = np.cumsum(random.normal(size=(3000, 11)) * 1e-4, axis=0)

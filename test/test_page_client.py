@@ -475,6 +475,21 @@ def test_exercise_is_begun_for_a_subject_and_two_attempts_are_opened_side_by_sid
         assert page.wait(lambda: page.evaluate(link), 'the link').endswith('&replay')
 
 
+def test_another_hello_changes_the_exercises_on_offer_and_not_the_scene_in_the_title(
+    browser: Browser,
+) -> None:
+    shown = "[...document.querySelectorAll('#exercise option')].map(option => option.text)"
+    title = "document.querySelector('#title').textContent"
+    offers = [{'name': name, 'title': name.upper()} for name in ('circle', 'pad')]
+    stand_in = StandIn(hello={'exercises': offers})
+    with opened(browser, stand_in) as page:
+        page.wait(lambda: page.evaluate(shown) == ['CIRCLE', 'PAD'], 'two exercises')
+        page.wait(lambda: page.evaluate(title) == 'liver · combined', 'the title')
+        stand_in.greet(exercises=offers[:1])
+        page.wait(lambda: page.evaluate(shown) == ['CIRCLE'], 'one exercise')
+        assert page.evaluate(title) == 'liver · combined'
+
+
 def test_page_without_an_exercise_shows_none(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:

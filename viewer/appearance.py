@@ -45,6 +45,7 @@ def tool_shape(tool: ToolSettings) -> dict[str, Any]:
         'radius': tool.radius,
         'blade_tip': list(tool.blade_tip),
         'blade_facing': tool.facing().tolist(),
+        'cuts': tool.mode == 'scalpel',
     }
 
 
@@ -111,7 +112,11 @@ def shown_exercise(exercise: ExerciseSettings) -> dict[str, Any] | None:
         'title': exercise.title[:_MAX_TITLE],
         'instruction': exercise.instruction[:_MAX_INSTRUCTION],
         'targets': [
-            {'points': np.round(target.corners(), 6).tolist(), 'margin': target.margin}
+            {
+                'points': np.round(target.corners(), 6).tolist(),
+                'margin': target.margin,
+                'depth': target.depth,
+            }
             for target in exercise.targets
         ],
         'zones': [{'points': zone.points, 'radius': zone.radius} for zone in exercise.zones],

@@ -307,7 +307,6 @@ def put_moment(
         depth: of the blade's end [m].
         can_guide: whether the hand follows goals.
         further: tip [m] and wxyz of each further tool; None: it is not known.
-        can_guide: whether the hand follows goals.
     """
     if not moment.is_finite:
         return
@@ -320,6 +319,7 @@ def put_moment(
         depth=depth,
         can_guide=can_guide,
         contact=moment.contact,
+        clutched=moment.clutched,
         further=list(further),
     )
 

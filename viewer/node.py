@@ -328,7 +328,8 @@ class ViewerNode(ManagedNode):
             return 'The haptic bridge is silent.'
         if self._operation.e_stopped:
             return 'E-STOP: no force until it is reset, and then Start.'
-        guided = 'The blade follows the pointer; hold the button to cut.' if can_guide else ''
+        deed = 'cut' if self._tools[0].mode == 'scalpel' else 'press'
+        guided = f'The tool follows the pointer; hold the button to {deed}.' if can_guide else ''
         said = {
             CrtkState.ENABLED: f'Force is on. {guided}',
             CrtkState.PAUSED: 'No force. Start goes on.',

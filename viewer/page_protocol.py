@@ -16,10 +16,10 @@ the one before:
 | nodes | rows of name, level, message, rate |
 | session | scene, method, recording, busy, scenes |
 | scale | value, min, max |
-| moment | tip, wxyz, proxy, force, depth, can_guide, contact, further: tip and wxyz of each further tool, null where it is not known |
+| moment | tip, wxyz, proxy, force, depth, can_guide, contact, clutched, further: tip and wxyz of each further tool, null where it is not known |
 | plots | span, lines of title, unit, times, values and colours by name, least |
 | playhead | time, playing, speed |
-| attempt | rows of name, value, over; score: null, or points, passed, reasons once the tip is back at the end |
+| attempt | rows of name, value, over; score: null, or points, passed, reasons once the attempt is over |
 | attempts | rows of bag, subject, exercise, attempt, begun, state, points, passed, newest first |
 | replay | number: of the request, link: to open |
 | notice | id, text |

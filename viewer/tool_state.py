@@ -24,6 +24,7 @@ class Moment(NamedTuple):
         proxy: centre of the proxy sphere [m], shape (3,).
         contact: NONE, TOUCHING or INSIDE.
         force: on the hand [N], tissue axes, shape (3,).
+        clutched: whether a clutch has the hand off the tool.
     """
 
     tip: Floats
@@ -32,6 +33,7 @@ class Moment(NamedTuple):
     proxy: Floats
     contact: int
     force: Floats
+    clutched: bool = False
 
     @property
     def is_finite(self) -> bool:
@@ -87,6 +89,7 @@ class Translator:
             proxy=get('proxy'),
             contact=int(get('state')[0]),
             force=force,
+            clutched=indexing is not None and indexing.clutched,
         )
 
 

@@ -1,21 +1,17 @@
 // The controls of a live session: buttons, choices, the state, the table of nodes.
 
+import { fill } from './fill.js';
+import { Gauge } from './gauge.js';
+
 const STATES = {
   ENABLED: ['▶', 'FORCE ON'], PAUSED: ['❚❚', 'PAUSED'], DISABLED: ['○', 'FORCE OFF'], FAULT: ['▲', 'FAULT'],
 };
 const LEVELS = [['●', 'ok'], ['▲', 'warning'], ['✕', 'error'], ['?', 'silent']];
 const SCALE_MS = 100;
+const FULL_FORCE = 5, FULL_DEPTH = 20; // [N], [mm] of the gauges without an exercise
 const CONTACTS = ['free', 'touching', 'inside'];
 
 const $ = (id) => document.getElementById(id);
-
-function fill(select, values) {
-  const known = [...select.options].map((option) => option.value);
-  if (known.length === values.length && known.every((value, i) => value === values[i])) return;
-  const chosen = select.value;
-  select.replaceChildren(...values.map((value) => new Option(value, value)));
-  if (values.includes(chosen)) select.value = chosen;
-}
 
 export class Controls {
   /** @param {function} send sends a message of the page */
@@ -26,6 +22,7 @@ export class Controls {
     this.session = { scene: '', method: '', recording: '', busy: '', scenes: [] };
     this.state = { state: '', text: '', e_stopped: false };
     this._lastScale = 0;
+    [this._forceGauge, this._depthGauge] = ['force', 'depth'].map((name) => new Gauge($(`${name}-gauge`)));
     for (const op of ['start', 'pause', 'reset']) $(op).addEventListener('click', () => send({ op }));
     $('record').addEventListener('click', () => send({ op: 'record', on: !this.session.recording }));
     for (const id of ['scene', 'method']) $(id).addEventListener('change', () => this._choose());
@@ -38,7 +35,17 @@ export class Controls {
     this._scenes = hello.scenes;
     fill($('scene'), hello.scenes);
     fill($('method'), hello.methods);
+    this._scaleGauges(hello.exercise);
     this.showSession(this.session);
+  }
+
+  // The allowed part of the force is up to its limit, of the depth the band of the targets.
+  _scaleGauges(exercise) {
+    const limit = exercise?.force_limit ?? FULL_FORCE;
+    this._forceGauge.range(exercise ? 2 * limit : limit, [0, limit]);
+    const bands = (exercise?.targets ?? []).map(({ depth }) => depth.map((end) => 1000 * end));
+    const [low, high] = [Math.min(...bands.map(([end]) => end)), Math.max(...bands.map(([, end]) => end))];
+    this._depthGauge.range(bands.length ? 2 * high : FULL_DEPTH, bands.length ? [low, high] : [0, FULL_DEPTH]);
   }
 
   showState(state) {
@@ -90,7 +97,11 @@ export class Controls {
   /** @param {object} moment @param {number|null} height of the blade's end over the surface [m] */
   showMoment(moment, height) {
     $('hud').hidden = false;
-    $('hud-force').textContent = Math.hypot(...moment.force).toFixed(2);
+    const force = Math.hypot(...moment.force);
+    $('hud-force').textContent = force.toFixed(2);
+    this._forceGauge.show(force);
+    this._depthGauge.show(1000 * moment.depth);
+    $('hud-clutch').hidden = !moment.clutched;
     const above = moment.depth === 0 && height > 0;
     $('hud-depth-name').textContent = above ? 'Height' : 'Depth';
     $('hud-depth').textContent = (1000 * (above ? height : moment.depth)).toFixed(1);

@@ -295,7 +295,7 @@ export class Guide {
     this._level += step;
     if (!this.cutting) return Math.abs(wanted - this._level) > 1e-6;
     this._entered ||= inside;
-    if (this._entered) this._push = 0;
+    if (this._entered || !this._stage.tool.cuts) this._push = 0;
     else if (this._level - wanted < 1e-9) this._push = clamp(this._push + DOWN * dt, [0, MAX_PUSH]);
     return true;
   }
@@ -303,7 +303,8 @@ export class Guide {
   /** Follows the path of a cut, the edge ahead; returns whether it goes on. */
   _along(dt) {
     // The blade waits where it goes in.
-    let left = this._entered || this._push === MAX_PUSH ? STROKE * dt * this._head(dt) : 0;
+    const goes = this._entered || this._push === MAX_PUSH || !this._stage.tool.cuts;
+    let left = goes ? STROKE * dt * this._head(dt) : 0;
     while (this._path.length > 0 && left > 0) {
       const next = this._path[0], far = next.point.distanceTo(this._aim.point);
       const share = Math.min(1, left / Math.max(far, 1e-12));

@@ -109,7 +109,7 @@ function begin(hello) {
   stop.active = live;
   timeline.active = !live;
   connection.expects = live;
-  $('title').textContent = hello.title;
+  if (!live || other) $('title').textContent = live ? '' : hello.title; // a session says its scene
   if (other) {
     plots.clear();
     plots = new Plots($('plots'), live ? null : (time) => timeline.seek(time));
@@ -122,6 +122,7 @@ function begin(hello) {
   onStage(() => {
     stage.begin(hello);
     guide.bounds = hello.bounds ?? null;
+    showGuide();
   });
 }
 
@@ -213,7 +214,9 @@ function showGuide() {
   for (const [name, on] of Object.entries(pressed)) {
     $('guide').querySelector(`[data-guide=${name}]`).setAttribute('aria-pressed', String(on));
   }
-  const [word, length] = guide.cutting ? ['Cut depth', guide.depth] : ['Height', guide.height];
+  const verb = stage.tool.cuts ? 'Cut' : 'Press';
+  $('guide').querySelector('[data-guide=cut]').textContent = verb;
+  const [word, length] = guide.cutting ? [`${verb} depth`, guide.depth] : ['Height', guide.height];
   $('guide-set').textContent = `${word} ${(1000 * length).toFixed(1)} mm`;
 }
 

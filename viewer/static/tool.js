@@ -29,6 +29,7 @@ export class Tool {
     this.end = new Vector3(0, 0, 0.1);
     this.bladeEnd = new Vector3();
     this.facing = new Vector3();
+    this.cuts = true; // else it presses only
     scene.add(this.group, this.ghost);
   }
 
@@ -45,6 +46,7 @@ export class Tool {
     }
     this.bladeEnd.fromArray(tool.blade_tip);
     this.facing.fromArray(tool.blade_facing);
+    this.cuts = tool.cuts;
     this.end.set(0, 0, 0);
     for (const corner of tool.handle.vertices) {
       const [x, y, z] = corner;

@@ -1,8 +1,9 @@
 // Exercises to begin, attempts that were made, and replays of them.
 
+import { fill } from './fill.js';
+
 const $ = (id) => document.getElementById(id);
 const MAX_CHOSEN = 2;
-const RESULTS = { 'broken off': 'broken off', 'not scored': 'not scored' };
 
 export class Training {
   /** @param {function} send takes a message of the page @param {function} say takes a notice */
@@ -18,9 +19,7 @@ export class Training {
   }
 
   begin({ exercises }) {
-    const known = [...$('exercise').options].map((option) => option.value);
-    if (exercises.every(({ name }, index) => name === known[index])) return;
-    $('exercise').replaceChildren(...exercises.map(({ name, title }) => new Option(title, name)));
+    fill($('exercise'), exercises.map(({ name }) => name), exercises.map(({ title }) => title));
   }
 
   /** Shows the attempts, newest first. */
@@ -46,8 +45,7 @@ export class Training {
     task.textContent = row.exercise;
     who.textContent = `${row.subject}, attempt ${row.attempt}`;
     cells[1].append(task, who);
-    const points = row.points === null ? '' : `${row.passed ? '✓' : '✕'} ${row.points.toFixed(1)}`;
-    cells[2].textContent = RESULTS[row.state] ?? points;
+    cells[2].textContent = row.points === null ? row.state : `${row.passed ? '✓' : '✕'} ${row.points.toFixed(1)}`;
     cells[2].title = row.points === null ? '' : row.passed ? 'passed' : 'not passed';
     shown.title = `${row.bag}, ${new Date(1000 * row.begun).toLocaleString()}`;
     return shown;
