@@ -17,6 +17,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.parameter import Parameter
 
 from cutting_trainer.haptic_bridge.device_button import DeviceButton
+from cutting_trainer.haptic_bridge.device_jaw import DeviceJaw
 from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
 from cutting_trainer.haptic_bridge.devices.probe_graph import Wiring
 from cutting_trainer.haptic_bridge.e_stop_topic import EStop, Listener
@@ -169,6 +170,9 @@ class HapticBridge(ManagedNode):
         self._mode_button = None
         if device.mode_button is not None:
             self._mode_button = DeviceButton(self, BUTTON, device.mode_button, self._change_mode)
+        self._jaw = None
+        if device.jaw_closed is not None:
+            self._jaw = DeviceJaw(self, device.jaw_closed, self._change_jaw)
         clutch = (CLUTCH, 0) if device.clutch_button is None else (BUTTON, device.clutch_button)
         self._clutch = DeviceButton(self, *clutch, self._change_clutch)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -265,8 +269,14 @@ class HapticBridge(ManagedNode):
     def _change_mode(self, pressed: bool) -> None:
         """Make a palpator of the scalpel, or close the jaws of a grasper, and back."""
         if pressed:
-            mode = self._path.next_mode.other.name.lower()
-            self.set_parameters([Parameter('tool_mode', value=mode)])
+            self._set_mode(self._path.next_mode.other)
+
+    def _change_jaw(self, closed: bool) -> None:
+        """Make of the tool what it is with its jaws closed, or open."""
+        self._set_mode(self._path.next_mode.with_jaws(closed=closed))
+
+    def _set_mode(self, mode: ToolMode) -> None:
+        self.set_parameters([Parameter('tool_mode', value=mode.name.lower())])
 
     def _change_clutch(self, pressed: bool) -> None:
         """Take the hand off the tool while the button is pressed."""
@@ -332,6 +342,8 @@ class HapticBridge(ManagedNode):
             self._machine.fault(stranger)
         if self._button is not None:
             self._button.enforce()
+        if self._jaw is not None:
+            self._jaw.poll()
         self._auto_enable.look(self._can_begin)
         now = time.monotonic()
         if self._machine.state is CrtkState.ENABLED and now >= self._wiring_due:

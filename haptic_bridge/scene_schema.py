@@ -138,6 +138,14 @@ class DeviceSettings(SceneModel):
         description='index into buttons of arm/button that takes the hand off the tool while it is '
         'pressed; without it, buttons[0] of arm/clutch does',
     )
+    jaw_closed: float | None = Field(
+        None,
+        ge=-1,
+        le=3,
+        description='angle of arm/jaw/measured_js [rad] at which the jaws of a grasper close, or '
+        'scissors become a scalpel; 0.1 above it they open, or become a palpator. Without it the '
+        'jaws are not followed',
+    )
     accepted_publishers: tuple[str, ...] = Field(
         (),
         max_length=32,

@@ -45,6 +45,14 @@ ARGUMENTS: dict[str, tuple[Any, str]] = {
         'topic below it on which the device takes the force, unless the scene sets it: servo_cf, '
         'body/servo_cf or spatial/servo_cf',
     ),
+    'psm': ('/PSM1', 'namespace of the simulated arm whose instrument is the tool'),
+    'pose_topic': (
+        'measured_cp',
+        'topic of its pose below it: measured_cp, or local/measured_cp for the frame of its base',
+    ),
+    'master': ('/MTMR', 'namespace of the arm in the hand, which takes the force'),
+    'button': ('/console/operator_present', 'topic of device.hold_button, and of other buttons'),
+    'clutch': ('/console/clutch', 'topic that takes the hand off the tool while it is pressed'),
 }
 TYPES = {
     **{'scene': str, 'seed': int, 'seconds': float, 'auto_enable': bool, 'bag': str},
@@ -80,6 +88,7 @@ def nodes(
     namespace: Any = None,
     arguments: Mapping[str, str] | None = None,
     device: Any = None,
+    topics: Mapping[str, Sequence[Any]] | None = None,
 ) -> list[Any]:
     """Return nodes of a session.
 
@@ -88,11 +97,12 @@ def nodes(
         namespace: namespace of the nodes; None: the argument `namespace`.
         arguments: launch arguments that replace others, as `left_scene` replaces `scene`.
         device: namespace of the device; None: `arm`, below that of the nodes.
+        topics: names of those topics that are not below it, by their name in `DEVICE_TOPICS`.
     """
     where = LaunchConfiguration('namespace') if namespace is None else namespace
     called = arguments or {}
-    chosen = {'servo_cf': ['/', LaunchConfiguration('force_topic')]}
-    remapped = [(f'arm/{t}', [device, *chosen.get(t, [f'/{t}'])]) for t in DEVICE_TOPICS]
+    chosen = {'servo_cf': [device, '/', LaunchConfiguration('force_topic')], **(topics or {})}
+    remapped = [(f'arm/{t}', chosen.get(t, [device, f'/{t}'])) for t in DEVICE_TOPICS]
     return [
         Node(
             package=PACKAGE,

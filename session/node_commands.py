@@ -33,7 +33,7 @@ SHARED = ('tissue/mesh', 'tissue/mesh_updates', 'tissue/get_mesh', 'haptic_bridg
 """Topics and services of the graph that the bridge of a further tool uses."""
 DEVICE_TOPICS = (
     *('measured_cp', 'servo_cf', 'body/servo_cf', 'spatial/servo_cf'),
-    *('button', 'clutch', 'operating_state', 'state_command'),
+    *('button', 'clutch', 'jaw/measured_js', 'operating_state', 'state_command'),
 )
 """Topics between bridge, viewer and device."""
 RESTART_PARAMETERS: dict[str, dict[str, object]] = {

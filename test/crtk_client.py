@@ -14,7 +14,8 @@ checked against that source line by line, in what the other side can see:
   `__wait_for_operating_state` waits for the messages that follow until one has the state;
 - `utils.__home`, `__unhome`: the same with `__wait_for_homed`, which clears the event after the
   command was sent, and also waits for `is_busy` to be False;
-- `utils.__set_timestamp`, `__servo_cf`: each message has the stamp of its sending;
+- `utils.__set_timestamp`, `__servo_cf`, `__servo_cp`: each message has the stamp of its sending and
+  an empty frame_id;
 - `utils.__measured_cf` and the like: a TimeoutError where the newest message is older than 1 s;
 - its single-threaded executor in a daemon thread (`ral.spin`). It has no use for the query service.
 
@@ -210,6 +211,7 @@ def play_with_arm(client, namespace):
         )
     }
     servo_cf = client.publisher(WrenchStamped, f'{namespace}/servo_cf')
+    hand = client.publisher(PoseStamped, f'{namespace}/hand/servo_cp')
     client.thread.start()
     client.check_connections()
 
@@ -248,6 +250,11 @@ def play_with_arm(client, namespace):
     pose = read['measured_cp']()
     report['frame'] = pose.header.frame_id
     report['position'] = [pose.pose.position.x, pose.pose.position.z]
+    goal = client.stamped(PoseStamped())
+    goal.pose.orientation.w, goal.pose.position.z = 1.0, 0.05
+    hand.publish(goal)
+    time.sleep(1.0)
+    report['guided to'] = read['measured_cp']().pose.position.z
     report['messages'] = {name: len(newest.messages) for name, newest in read.items()}
     return report
 

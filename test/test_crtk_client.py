@@ -84,7 +84,7 @@ def at_once(joined: dict[str, Any], state: str) -> None:
 
 def test_a_crtk_client_that_joins_late_enables_reads_moves_and_operates_the_arm(types, scene):
     names = ('measured_cp', 'measured_cv', 'measured_cf', 'button')
-    names = (*names, 'operating_state', 'state_command')
+    names = (*names, 'operating_state', 'state_command', 'hand/servo_cp')
     remapped = {f'arm/{name}': f'/MTML/{name}' for name in names}
     remapped['arm/body/servo_cf'] = '/MTML/servo_cf'  # the client has no `body`
     with started('emulated_arm', scene, in_domain(types[1]), remapped):
@@ -100,6 +100,7 @@ def test_a_crtk_client_that_joins_late_enables_reads_moves_and_operates_the_arm(
     assert all(seen['around'])
     assert seen['frame'] == 'MTML_base'
     assert seen['position'] == pytest.approx([0.01, 0.03], abs=2e-3)
+    assert seen['guided to'] == pytest.approx(0.05, abs=2e-3)
     assert all(count > 100 for count in seen['messages'].values())
 
 

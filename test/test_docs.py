@@ -124,7 +124,8 @@ def made() -> set[tuple[str, str]]:
                     kind, name = (ast.unparse(argument) for argument in call.args[:2])
                     topic = eval(name, names | vars(ros))
                     found.add((topic.lstrip('/'), kind))
-    found.add((f'{ros.ARM}/clutch', 'Joy'))  # of a device; the emulated arm has none
+    # Of a device; the emulated arm has none.
+    found |= {(f'{ros.ARM}/clutch', 'Joy'), (f'{ros.ARM}/jaw/measured_js', 'JointState')}
     found |= {(ros.MARKERS, 'MarkerArray'), (ros.HAND, 'PoseStamped')}  # of the viewer
     found |= {(ros.E_STOP, 'Empty'), (ros.DIAGNOSTICS.lstrip('/'), 'DiagnosticArray')}
     found |= {(service, 'GetMesh') for service in ros.MESH_RECOVERY_SERVICES}

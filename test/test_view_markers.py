@@ -18,6 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from cutting_trainer.haptic_bridge.force_kernels import TOUCHING
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, ToolSettings, Vector
 from cutting_trainer.node_common import ros
+from cutting_trainer.node_common.orientation import from_quaternion
 from cutting_trainer.node_common.qos import LATCHED
 from cutting_trainer.node_common.ros import STATIC_FRAMES
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
@@ -201,9 +202,27 @@ def test_static_frames_are_those_of_the_drivers_poses_and_of_the_scene_that_runs
         [(t.header.frame_id, t.child_frame_id, t.transform.translation.x) for t in transforms]
         for transforms in talker.published
     ]
-    both = ('MTML_base', 'arm_base')
     assert said[0] == [('tissue', 'arm_base', 0.0)]
-    assert said[1:] == [[('tissue', name, x) for name in both] for x in (0.0, 0.1)]
+    both = [[('MTML_base', 'tissue', -x), ('tissue', 'arm_base', x)] for x in (0.0, 0.1)]
+    assert said[1:] == both
+
+
+def test_the_tissue_is_below_the_frame_of_a_driver_where_it_is_above_our_own():
+    turned = {'translation': (0.1, 0.0, 0.06), 'rotation_rpy_deg': (0.0, 0.0, 90.0)}
+    device = DeviceSettings.model_validate({'tissue_from_device': turned})
+    matrices = {}
+    for name in ('arm_base', 'ECM_view'):
+        frame = device_frame(device, name)
+        to, q = frame.transform.translation, frame.transform.rotation
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = from_quaternion(np.array([q.x, q.y, q.z, q.w])), vector(to)
+        matrices[frame.header.frame_id, frame.child_frame_id] = matrix
+    inverse = np.linalg.inv(matrices['ECM_view', 'tissue'])
+    assert_allclose(matrices['tissue', 'arm_base'], inverse, atol=1e-12)
+
+
+def vector(xyz: Any) -> list[float]:
+    return [xyz.x, xyz.y, xyz.z]
 
 
 def test_two_trainers_in_one_domain_share_no_topic_but_the_diagnostics():

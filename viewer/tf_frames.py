@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
@@ -21,18 +22,26 @@ DEVICE_FRAME = f'{ARM}_base'
 
 
 def device_frame(device: DeviceSettings, name: str = DEVICE_FRAME) -> TransformStamped:
-    """Return the transform from the tissue's frame to the device's; it has no motion scale.
+    """Return the transform between the tissue's frame and the device's; it has no motion scale.
+
+    Our own frame of the device is below the tissue's. That of a driver may be in a tree already,
+    and two parents would break it: so the tissue's is below that one.
 
     Args:
         device: the scene's section `device`.
         name: of the device's frame.
     """
     frame = device.tissue_from_device
-    message = TransformStamped(child_frame_id=name)
-    message.header.frame_id = FRAME
+    place, rotation = np.array(frame.translation), frame.rotation()
+    parent, child = FRAME, name
+    if name != DEVICE_FRAME:
+        parent, child = name, FRAME
+        place, rotation = -rotation.T @ place, rotation.T
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
     to, turn = message.transform.translation, message.transform.rotation
-    to.x, to.y, to.z = map(float, frame.translation)
-    turn.x, turn.y, turn.z, turn.w = map(float, quaternion(frame.rotation()))
+    to.x, to.y, to.z = map(float, place)
+    turn.x, turn.y, turn.z, turn.w = map(float, quaternion(rotation))
     return message
 
 

@@ -63,6 +63,14 @@ TOPICS = (
         'buttons[0]: 1 takes the hand off the tool',
     ),
     Topic(
+        'arm/jaw/measured_js',
+        'sensor_msgs/msg/JointState',
+        qos.EVENTS,
+        'arm',
+        'any rate',
+        'angle of the jaws [rad]; not needed',
+    ),
+    Topic(
         'arm/servo_cf',
         WRENCH,
         qos.STREAM,

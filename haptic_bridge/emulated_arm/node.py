@@ -241,7 +241,8 @@ class ArmNode(ManagedNode):
         """Decode a goal for the hand; an invalid one is rejected, and the hand stays."""
         try:
             goal = self._cp.believed(data)
-            require_frame(HAND, goal.frame_id)
+            if goal.frame_id:  # clients of CRTK leave it empty
+                require_frame(HAND, goal.frame_id)
             position, orientation = np.array(goal.values[:3]), np.array(goal.values[3:])
             if np.linalg.norm(position) > _MAX_GOAL_DISTANCE_M:
                 text = f'{position} m is farther than {_MAX_GOAL_DISTANCE_M:g} m'

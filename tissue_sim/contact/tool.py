@@ -46,6 +46,15 @@ class ToolMode(enum.IntEnum):
         """The mode that a press of the mode button changes to."""
         return ToolMode(self ^ 1)
 
+    def with_jaws(self, *, closed: bool) -> 'ToolMode':
+        """Return the mode with jaws closed or open: a grasper's, or that of scissors.
+
+        Closed scissors are a scalpel, open ones a palpator.
+        """
+        if self.is_grasper:
+            return ToolMode.CLOSED_GRASPER if closed else ToolMode.OPEN_GRASPER
+        return ToolMode.SCALPEL if closed else ToolMode.PALPATOR
+
 
 class CutCommand(enum.IntEnum):
     """Command to the cutting service; numbers as in `Cut`."""
