@@ -134,7 +134,10 @@ def resimulate(
     changes: Changes = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute a recorded session again: identical, or where it first differs. Needs no ROS."""
+    """Compute a recorded session again: identical, or where it first differs. Needs no ROS.
+
+    With changes of the scene, the force that the recorded hand would feel, beside the recorded one.
+    """
     from cutting_trainer.recordings.resimulate_command import resimulate as compute
     from cutting_trainer.session.scene_overrides import parse_changes
 

@@ -27,6 +27,13 @@ Changes = Annotated[
     typer.Option(
         '--with',
         help='Change a key of the scene, as key=value; may be given again. The recorded hand then '
-        'meets the changed tissue, and the differences are shown.',
+        'meets the changed tissue.',
     ),
+]
+Workers = Annotated[
+    int, typer.Option(min=0, max=1024, help='Own workers; 0: one for each processor.')
+]
+Scheduler = Annotated[
+    str,
+    typer.Option(help='Address of a Dask scheduler whose workers compute, as tcp://host:8786.'),
 ]

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cutting_trainer.cli.options import EXIT_STATUSES, AsJson
+from cutting_trainer.cli.options import EXIT_STATUSES, AsJson, Changes, Scheduler, Workers
 
 commands = typer.Typer()
 
@@ -19,14 +19,8 @@ def study(
             '--output', '-o', help='Folder of the results (default: FILE without its suffix).'
         ),
     ] = None,
-    workers: Annotated[
-        int,
-        typer.Option(min=0, max=1024, help='Own workers; 0: one for each processor.'),
-    ] = 0,
-    scheduler: Annotated[
-        str,
-        typer.Option(help='Address of a Dask scheduler whose workers compute, as tcp://host:8786.'),
-    ] = '',
+    workers: Workers = 0,
+    scheduler: Scheduler = '',
     as_json: AsJson = False,
 ) -> None:
     """Compute recorded hands on many changed scenes, and the effect of each change. Needs no ROS.
@@ -58,17 +52,9 @@ def identify(
         float,
         typer.Option(min=1e-6, max=10.0, help='Noise of one component of the force, rms [N].'),
     ] = 0.003,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option('--with', help='Change a key of the scene, as key=value.'),
-    ] = None,
-    workers: Annotated[
-        int, typer.Option(min=0, max=1024, help='Own workers; 0: one for each processor.')
-    ] = 0,
-    scheduler: Annotated[
-        str,
-        typer.Option(help='Address of a Dask scheduler whose workers compute, as tcp://host:8786.'),
-    ] = '',
+    changes: Changes = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = '',
     as_json: AsJson = False,
 ) -> None:
     """Find the material under which recorded hands feel the recorded forces. Needs no ROS."""

@@ -8,10 +8,14 @@ from pathlib import Path
 
 from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.node_common.scene_reader import missing_file
+from cutting_trainer.recordings.attempts_command import index_bags
+from cutting_trainer.session.attempts import open_store
 from cutting_trainer.session.errors import SessionError
 
 _BLOCK_BYTES = 1 << 20
 _HASH_DIGITS = 16
+_MAX_NAMES = 10
+"""Names in a sentence."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,38 @@ def find_bags(patterns: Iterable[str], folder: Path) -> list[StudyBag]:
             bag = StudyBag(_name(path, folder), path, hash_of_bag(path))
             found.setdefault(bag.hash, bag)
     return list(found.values())
+
+
+def find_attempts(folder: Path, subject: str, exercise: str) -> tuple[list[str], list[str]]:
+    """Return the bags of scored attempts, and sentences about bags that cannot be read.
+
+    Args:
+        folder: of the bags and their index, which is brought up to date.
+        subject: only this one; '': every one.
+        exercise: only this one; '': every one.
+
+    Raises:
+        SessionError: there are none.
+    """
+    if not folder.is_dir():
+        raise SessionError(f'attempts: {missing_file(folder)}')
+    store = open_store(folder)
+    problems = index_bags(store, folder)
+    if rows := store.rows(subject, exercise, 'scored'):
+        # Brackets in a name are no pattern.
+        return [glob.escape(row.bag) for row in rows], problems
+    known = store.rows(state='scored')
+    wanted = {'exercise': exercise, 'subject': subject}
+    said = ' and '.join(f'{key} {value}' for key, value in wanted.items() if value)
+    there = [
+        f'{key}s {", ".join(names)}'
+        for key, value in wanted.items()
+        if value and (names := sorted({getattr(row, key) for row in known})[:_MAX_NAMES])
+    ]
+    raise SessionError(
+        f'attempts: {folder} has no scored attempt{f" of {said}" if said else ""}'
+        + (f': it has {"; ".join(there)}' if there else ': record one with `./trainer view`')
+    )
 
 
 def _bags_by(pattern: str, folder: Path) -> list[Path]:

@@ -159,12 +159,25 @@ class Designs(SceneModel):
         return self
 
 
+class Attempts(SceneModel):
+    """Bags of scored attempts, from their index."""
+
+    folder: str = Field(
+        default='', description='folder of the bags, relative to the study file; "": bags/sessions'
+    )
+    exercise: str = Field(default='', description='name of its scene; "": every exercise')
+    subject: str = Field(default='', description='pseudonym; "": every subject')
+
+
 class Study(SceneModel):
     """A study file."""
 
-    bags: list[str] = Field(
-        min_length=1,
+    bags: Annotated[list[str], Field(min_length=1)] | None = Field(
+        default=None,
         description='bags, folders with bags anywhere below, or globs, relative to the study file',
+    )
+    attempts: Attempts | None = Field(
+        default=None, description='bags of scored attempts: exercise, subject, folder'
     )
     settings: Designs = Field(description='designs: grid, cases, latin_hypercube, sobol')
     outputs: list[OutputName] = Field(
@@ -173,6 +186,12 @@ class Study(SceneModel):
     confidence: float = Field(
         default=0.95, ge=0.5, le=0.999, description='level of the intervals, 0.5 to 0.999'
     )
+
+    @model_validator(mode='after')
+    def _some_bags(self) -> Self:
+        if not self.bags and self.attempts is None:
+            raise ValueError('bags is missing: name bags, or attempts by exercise and subject')
+        return self
 
 
 def read_study(path: Path) -> Study:

@@ -85,6 +85,7 @@ class Result:
         warm_up: processor time of that [s]; 0 for all but its first row.
         memory: largest resident memory of the worker so far [bytes].
         lost: no worker has computed it, for a reason that is not that of bag or setting.
+        series: force on the hand at each pose, where the job asks for it.
     """
 
     outputs: dict[str, float]
@@ -95,16 +96,6 @@ class Result:
     warm_up: float
     memory: int
     lost: bool = False
-
-
-@dataclass(frozen=True)
-class SeriesResult(Result):
-    """A computed row with its force.
-
-    Attributes:
-        series: force on the hand at each pose.
-    """
-
     series: RecordedForce | None = None
 
 
@@ -144,13 +135,15 @@ def evaluate(job: Job) -> Result:
     began = time.thread_time()
     warm_up()
     warm, differs, failure, outputs = time.thread_time(), 0, '', dict[str, float]()
-    run: Run | None = None
+    series: RecordedForce | None = None
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
             outputs, differs, run = _compute(job, Path(temporary))
+            if job.series:
+                series = RecordedForce(run.times, run.forces, run.contact, run.vectors)
         except Exception as error:  # a row with its reason: the study goes on
             failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
-    result = Result(
+    return Result(
         outputs=outputs,
         failure=failure,
         differs_from_frame=differs,
@@ -158,11 +151,8 @@ def evaluate(job: Job) -> Result:
         cpu=time.thread_time() - warm,
         warm_up=warm - began,
         memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        series=series,
     )
-    if run is None or not job.series:
-        return result
-    series = RecordedForce(run.times, run.forces, run.contact, run.vectors)
-    return SeriesResult(**vars(result), series=series)
 
 
 @cache

@@ -23,7 +23,7 @@ from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.studies.bag_collection import StudyBag, find_bags
 from cutting_trainer.studies.designs import Setting
-from cutting_trainer.studies.evaluation import Job, SeriesResult, read_recording
+from cutting_trainer.studies.evaluation import Job, read_recording
 from cutting_trainer.studies.fit import Fit, Floats, Observation, Point
 from cutting_trainer.studies.identification import (
     PARAMETERS,
@@ -251,7 +251,7 @@ class _Running:
             key = keys[job.bag_hash, job.setting.identity]
             self.computed += 1
             self.cpu += result.cpu
-            if isinstance(result, SeriesResult) and result.series is not None:
+            if result.series is not None:
                 found[key] = result.series.vectors
             else:
                 self._reasons[result.failure] = self._reasons.get(result.failure, 0) + 1

@@ -22,9 +22,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from cutting_trainer.session.demo_command import SESSIONS
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
-from cutting_trainer.studies.bag_collection import StudyBag, find_bags
+from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find_bags
 from cutting_trainer.studies.description import Study, read_study
 from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.evaluation import Job, Result
@@ -124,7 +125,8 @@ def run_study(options: StudyOptions) -> Status:
     if find_spec('distributed') is None:
         raise SessionError(NO_DASK)
     study = read_study(options.file)
-    bags = find_bags(study.bags, options.file.resolve().parent)
+    notes = Console(stderr=True, soft_wrap=True)
+    bags = bags_of(study, options.file.resolve().parent, notes)
     settings = [RECORDED, *settings_of(study.settings)]
     if not options.folder.parent.is_dir() or options.folder.is_file():
         raise SessionError(
@@ -133,7 +135,6 @@ def run_study(options: StudyOptions) -> Status:
     options.folder.mkdir(exist_ok=True)
     with open_journal(options.folder, identity_of_worker()) as journal:
         plan = Plan(study, bags, settings, journal, {})
-        notes = Console(stderr=True, soft_wrap=True)
         interrupted = not _compute(plan, options, notes)
         _write_tables(options.folder, plan)
         rows = plan.rows()
@@ -144,6 +145,20 @@ def run_study(options: StudyOptions) -> Status:
         notes.print('interrupted: the same command goes on with what is left', highlight=False)
         return Status.INTERRUPTED
     return Status.FAILED if summary.failures else Status.OK
+
+
+def bags_of(study: Study, folder: Path, notes: Console) -> list[StudyBag]:
+    """Return the bags that a study names and those of its attempts, each content once."""
+    found = {bag.hash: bag for bag in find_bags(study.bags or (), folder)}
+    if (wanted := study.attempts) is not None:
+        attempts, problems = find_attempts(
+            folder / wanted.folder if wanted.folder else SESSIONS, wanted.subject, wanted.exercise
+        )
+        for problem in problems:
+            notes.print(f'left out: {escape(problem)}', highlight=False)
+        for bag in find_bags(attempts, folder):
+            found.setdefault(bag.hash, bag)
+    return list(found.values())
 
 
 def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:

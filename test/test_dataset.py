@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from bench.files.lerobot_loader import differences, figures_of
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies.bag_collection import find_bags
@@ -55,3 +56,15 @@ def test_subjects_are_numbered_and_their_names_stay_out(tmp_path: Path) -> None:
     about = json.loads((tmp_path / 'set' / EPISODES_FILE).read_text())
     assert [of['subject'] for of in about] == ['subject-1', 'subject-2', 'subject-1']
     assert not any(b'Ann' in p.read_bytes() for p in (tmp_path / 'set').rglob('*') if p.is_file())
+
+
+def test_figures_of_a_loader_that_differ_from_a_bag_are_named() -> None:
+    bags = find_bags(['palpation'], SAMPLES) * 3
+    right = {**figures_of(bags[0]), 'wrong': 0.0}
+    heavier = {**right, 'largest_force': 1.001 * right['largest_force']}
+    assert differences(bags[:1], {'0': right}) == []
+    missing, force, order = differences(bags, {'1': heavier, '2': {**right, 'wrong': 4.0}})
+    assert (
+        missing == 'episode 0 is missing' and order == 'episode 2: 4 frames have other neighbours'
+    )
+    assert force.startswith('episode 1: largest_force 0.0')

@@ -179,6 +179,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer export bags/sessions/study bags/sessions/dataset --format lerobot --licence '
     'CC-BY-4.0': Nowhere('needs ten bags: test_dataset.py exports others'),
     'python -m bench.trials.identification': Nowhere('takes an hour'),
+    './trainer run python -m bench.files.lerobot_loader': Nowhere('it downloads 4 GB'),
     './trainer run dask scheduler': SCHEDULER,
     './trainer run dask worker tcp://HOST:8786 --nthreads 1': SCHEDULER,
     './trainer study config/studies/toughness.yaml --scheduler tcp://HOST:8786': SCHEDULER,

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from rich.console import Console
 
+from cutting_trainer.exercises.attempt_store import AttemptRow
 from cutting_trainer.node_common.errors import SceneError
+from cutting_trainer.session.attempts import open_store
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.studies.bag_collection import StudyBag, find_bags, hash_of_bag
+from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find_bags, hash_of_bag
 from cutting_trainer.studies.description import Study, read_study
 from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings, interval
@@ -20,6 +23,7 @@ from cutting_trainer.studies.evaluation import Result
 from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.journal import JOURNAL_FILE, Journal, key_of, open_journal
 from cutting_trainer.studies.outputs import OUTPUTS
+from cutting_trainer.studies.study_command import bags_of
 from cutting_trainer.studies.summary import as_text, summarise, write_page
 from cutting_trainer.studies.table import Row, write_table
 
@@ -138,6 +142,43 @@ def test_bags_are_found_below_folders_and_by_globs_each_content_once(tmp_path: P
     (tmp_path / 'empty').mkdir()
     with pytest.raises(SessionError, match='there is no bag in it'):
         find_bags(['empty'], tmp_path)
+
+
+def test_attempts_are_bags_by_exercise_and_subject(tmp_path: Path) -> None:
+    rows = [('a [1]', 'Ann', 'circle', 'scored'), ('b', 'Bob', 'circle', 'scored'),
+            ('c', 'Ann', 'pad', 'scored'), ('d', 'Ann', 'circle', 'broken off')]  # fmt: skip
+    store = open_store(tmp_path)
+    for number, (name, subject, exercise, state) in enumerate(rows):
+        bag = Path(shutil.copytree(SAMPLES / 'palpation', tmp_path / name))
+        with (bag / 'metadata.yaml').open('a') as file:
+            file.write(f'# {name}\n')
+        measures = {'time': 1.0}
+        store.put([AttemptRow(str(bag), subject, exercise, 1, number, state, measures=measures)])
+
+    def found(subject: str, exercise: str) -> list[str]:
+        return [bag.name for bag in find_bags(find_attempts(tmp_path, subject, exercise)[0],
+                                              tmp_path)]  # fmt: skip
+
+    assert found('', '') == ['a [1]', 'b', 'c']
+    assert found('Ann', '') == ['a [1]', 'c'] and found('Ann', 'circle') == ['a [1]']
+    with pytest.raises(SessionError, match=r'of exercise circles: it has exercises circle, pad$'):
+        find_attempts(tmp_path, '', 'circles')
+    with pytest.raises(SessionError, match=r'exercise pad and subject Bob: .*; subjects Ann, Bob'):
+        find_attempts(tmp_path, 'Bob', 'pad')
+    with pytest.raises(SessionError, match=r'attempts: .* does not exist'):
+        find_attempts(tmp_path / 'none', '', '')
+
+
+def test_a_study_takes_bags_and_attempts_each_content_once(tmp_path: Path) -> None:
+    for name in ('one', 'same'):
+        shutil.copytree(SAMPLES / 'palpation', tmp_path / 'kept' / name)
+    shutil.copytree(SAMPLES / 'straight_cut', tmp_path / 'cut')
+    store = open_store(tmp_path / 'kept')
+    bags = [str(tmp_path / 'kept' / 'same'), str(tmp_path / 'kept' / 'one')]
+    store.put([AttemptRow(b, 'Ann', 'pad', 1, 0, 'scored', measures={'time': 1.0}) for b in bags])
+    text = GOOD.replace('bags: [bags]', 'bags: [cut]\nattempts: {folder: kept, subject: Ann}')
+    found = bags_of(study(tmp_path, text), tmp_path, Console(quiet=True))
+    assert [bag.name for bag in found] == ['cut', 'kept/one']
 
 
 def result(force: float, failure: str = '') -> Result:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,13 @@ from distributed import Client, LocalCluster
 
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
-from cutting_trainer.studies.cluster import check_versions, compute, others_cluster, own_cluster
+from cutting_trainer.studies.cluster import (
+    check_versions,
+    compute,
+    others_cluster,
+    own_cluster,
+    wait_for_own,
+)
 from cutting_trainer.studies.designs import RECORDED, Setting
 from cutting_trainer.studies.evaluation import Job
 from cutting_trainer.studies.identity import identity_of_worker
@@ -252,6 +259,18 @@ def test_worker_that_dask_gives_up_is_started_anew() -> None:
         while not client.nthreads() or before in client.nthreads():
             assert time.monotonic() < until, 'there is no worker any more'
             time.sleep(0.1)
+
+
+@pytest.mark.parametrize(('load', 'starts'), [(0.0, False), (40.0 * (os.cpu_count() or 1), True)])
+def test_own_workers_have_more_time_to_start_on_a_loaded_machine(
+    load: float, starts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('cutting_trainer.studies.cluster.WORKERS_TIMEOUT_S', 0.1)
+    monkeypatch.setattr('os.getloadavg', lambda: (load, load, load))
+    ready = time.monotonic() + 0.5
+    late: Any = SimpleNamespace(nthreads=lambda: {'w': 1} if time.monotonic() > ready else {})
+    with nullcontext() if starts else pytest.raises(SessionError, match='no worker has started'):
+        wait_for_own(late, 1)
 
 
 def test_worker_that_takes_too_much_memory_is_ended_and_its_row_says_so(
