@@ -308,6 +308,7 @@ export class Guide {
 
   /** Follows the path of a cut, the edge ahead; returns whether it goes on. */
   _along(dt) {
+    if (!this.cutting) return false;
     // The blade waits where it goes in.
     const goes = this._entered || this._push === MAX_PUSH || !this._stage.tool.cuts;
     let left = goes ? STROKE * dt * this._head(dt) : 0;
