@@ -13,6 +13,8 @@ import numpy as np
 from bench.page.browser import Page
 
 ROOT = Path(__file__).resolve().parents[1]
+REACHED_M = 0.003
+"""[m] beside a place where the blade is over it."""
 
 
 def sessions() -> set[Path]:
@@ -39,7 +41,7 @@ class View:
 
     def url(self) -> str:
         """Where the page is, once all nodes are ready."""
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 240
         while self._said.read_text().count(' is ready') < 5:
             assert self.process.poll() is None and time.monotonic() < deadline, self.said
             time.sleep(0.1)
@@ -57,35 +59,51 @@ class View:
 
 
 def point(page: Page, place: np.ndarray) -> None:
-    """Lets the blade come over a place of the tissue [m]."""
-    start(page)
-    page.wait(lambda: page.state()['canGuide'], 'the hand')
-    x, y = page.pixels(place[None])[0]
-    for beside in (6.0, 3.0, 0.0):
-        page.mouse('mouseMoved', x + beside, y)
-        time.sleep(0.1)
-    time.sleep(1.0)
+    """Lets the blade come over a place of the tissue [m].
+
+    The mouse moves again where a machine that stood still has lost a motion.
+    """
+    for _ in range(10):
+        start(page)
+        page.wait(lambda: page.state()['canGuide'], 'the hand')
+        x, y = page.pixels(place[None])[0]
+        for beside in (6.0, 3.0, 0.0):
+            page.mouse('mouseMoved', x + beside, y)
+            time.sleep(0.1)
+        deadline = time.monotonic() + 5.0
+        while time.monotonic() < deadline:
+            time.sleep(0.2)
+            if off(page, place) < REACHED_M:
+                time.sleep(0.5)
+                return
+    raise AssertionError(page.state())
 
 
-def cut(page: Page, begin: np.ndarray, end: np.ndarray, notches: int = 0) -> None:
-    """Cuts from one place of the surface to another [m], the button held.
+def off(page: Page, place: np.ndarray) -> float:
+    """How far the tip is beside a place, in the plane [m]."""
+    tip = np.array(page.state()['moment']['tip'])
+    return float(np.linalg.norm((tip - place)[:2]))
+
+
+def cut(page: Page, places: np.ndarray, notches: int = 0) -> None:
+    """Cuts through places of the surface, the button held until the blade is at the last one.
 
     Args:
         page: to use.
-        begin: of the cut.
-        end: of it.
+        places: [m], shape (n, 3); one: presses there.
         notches: of the wheel, each 0.5 mm deeper than 6 mm.
     """
-    point(page, begin)
-    places = page.pixels(np.linspace(begin, end, 12))
-    page.mouse('mousePressed', *places[0], pressed=True)
-    x, y = places[0]
+    point(page, places[0])
+    pixels = page.pixels(places)
+    page.mouse('mousePressed', *pixels[0], pressed=True)
+    x, y = pixels[0]
     for _ in range(notches):
         page.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0, deltaY=120)
-    time.sleep(1.0)
-    for place in places[1:]:
-        page.mouse('mouseMoved', *place, pressed=True)
+    time.sleep(1.5)
+    for pixel in pixels[1:]:
+        page.mouse('mouseMoved', *pixel, pressed=True)
         time.sleep(0.1)
+    page.wait(lambda: off(page, places[-1]) < REACHED_M, 'the end of the stroke')
     time.sleep(0.7)
 
 

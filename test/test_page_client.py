@@ -190,6 +190,45 @@ def test_blade_follows_the_pointer_and_goes_in_while_the_button_is_held(browser:
         assert len(stand_in.of(Guide)) == goals
 
 
+def test_a_palpator_follows_the_pointer_and_presses_no_deeper_than_it_is_set(
+    browser: Browser,
+) -> None:
+    stand_in = StandIn('lumps')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        place = on_top(stand_in, -0.015, -0.012)
+        (pixel,) = page.pixels(place[None])
+        page.mouse('mouseMoved', *pixel)
+        stand_in.wait(lambda: np.allclose(stand_in.tip, place + 0.008 * UP, atol=1e-3))
+        page.mouse('mousePressed', *pixel, pressed=True)
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < place[2] - 0.0055)
+        time.sleep(1.0)
+        deepest = min(end_of_blade(goal)[2] for goal in stand_in.of(Guide))
+        assert deepest == pytest.approx(place[2] - 0.006, abs=3e-4)
+        assert page.says('Press depth')
+        page.mouse('mouseReleased', *pixel)
+
+
+def test_no_cut_begins_or_goes_on_in_an_old_picture(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        begin, end = (on_top(stand_in, x, -0.008) for x in (-0.008, 0.008))
+        places = page.pixels(np.array([begin, end]))
+        page.mouse('mouseMoved', *places[0])
+        stand_in.wait(lambda: np.allclose(stand_in.tip, begin + 0.008 * UP, atol=1e-3))
+        stand_in.stands_still.set()
+        page.wait(lambda: page.state()['stale'], 'the age')
+        goals = len(stand_in.of(Guide))
+        page.mouse('mousePressed', *places[0], pressed=True)
+        page.mouse('mouseMoved', *places[1], pressed=True)
+        time.sleep(1.0)
+        assert len(stand_in.of(Guide)) == goals
+        stand_in.stands_still.clear()
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[0] > end[0] - 1e-3)
+        page.mouse('mouseReleased', *places[1])
+
+
 def test_no_goal_jumps_and_the_edge_turns_to_the_stroke(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:

@@ -61,12 +61,12 @@ class Made:
 def use(page: Page, known: set[Path]) -> tuple[Path, Any, Any]:
     """Cuts, records the next cut alone; the bag, and the page's state before and after it."""
     page.wait(lambda: page.state().get('tip') and page.state()['meshes'], 'the page')
-    cut(page, BEGIN, MIDDLE, NOTCHES)
+    cut(page, np.linspace(BEGIN, MIDDLE, 12), NOTCHES)
     before = page.state()
     page.evaluate("document.querySelector('#record').click()")  # the mouse holds the cut
     page.wait(lambda: page.state()['recording'] and not page.state()['busy'], 'the recording')
     page.mouse('mouseReleased', *page.pixels(MIDDLE[None])[0])
-    cut(page, MIDDLE, END, NOTCHES)
+    cut(page, np.linspace(MIDDLE, END, 12), NOTCHES)
     after = page.state()
     page.mouse('mouseReleased', *page.pixels(END[None])[0])
     page.press('record')

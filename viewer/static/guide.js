@@ -34,12 +34,14 @@ export class Guide {
    * @param {object} stage the drawn scene
    * @param {function} send takes position and wxyz
    * @param {function} changed called after a change of what `said` returns
+   * @param {function} isOld returns whether the picture is old: nothing is cut then
    */
-  constructor(place, stage, send, changed) {
+  constructor(place, stage, send, changed, isOld) {
     this._place = place;
     this._stage = stage;
     this._send = send;
     this._changed = changed;
+    this._isOld = isOld;
     this.allowed = false;
     this.bounds = null;
     this.follows = true;
@@ -274,6 +276,10 @@ export class Guide {
     this._last = now;
     if (this.goal === null || moment === null) return;
     this._next = now + PERIOD_MS;
+    if (this.cutting && this._isOld()) { // whether the blade is in is not known
+      this._timer = setTimeout(() => this._advance(), PERIOD_MS);
+      return;
+    }
     const end = new Vector3().fromArray(moment.tip).add(this._toEnd());
     const way = Math.hypot(end.x - this._aim.point.x, end.y - this._aim.point.y);
     const sinks = this._down(dt, way, moment.contact === INSIDE);
@@ -302,6 +308,7 @@ export class Guide {
 
   /** Follows the path of a cut, the edge ahead; returns whether it goes on. */
   _along(dt) {
+    if (!this.cutting) return false;
     // The blade waits where it goes in.
     const goes = this._entered || this._push === MAX_PUSH || !this._stage.tool.cuts;
     let left = goes ? STROKE * dt * this._head(dt) : 0;

@@ -162,7 +162,7 @@ async function openStage() {
   try {
     const [{ Stage }, { Guide }] = await Promise.all([import('./stage.js'), import('./guide.js')]);
     stage = new Stage($('view'), query.get('quality'));
-    guide = new Guide($('view'), stage, (position, wxyz) => connection.send({ op: 'guide', position, wxyz }), showGuide);
+    guide = new Guide($('view'), stage, (position, wxyz) => connection.send({ op: 'guide', position, wxyz }), showGuide, () => connection.stale);
     for (const job of waiting) job();
     connectViews();
     allowGuide();
