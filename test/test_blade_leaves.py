@@ -62,7 +62,7 @@ class Drawn:
         )
         start = np.array([0.042 + shift, 0.0138, TOP + 0.001])
         deep = start - [0.0, 0.0, 0.009]
-        out = deep + [0.045, 0.0, 0.0]
+        out = start + np.array([0.045, 0.0, -0.009])
         ways = [eased(start, deep, 0.6, RATE), eased(deep, out, 0.5, RATE), [out] * 5]
         self.commands: list[CutCommand] = []
         self.areas: list[float] = []

@@ -42,10 +42,11 @@ SUBJECTS = {
     ),
     'blade': Subject(
         modules=('blade_severance', 'blade_law', 'blade_contact'),
+        together=('blade_phases',),
         not_covered={
             3: 'of the law: edge, spine and flat do not differ',
             4: 'the force in the hand is not measured here',
-            5: 'it needs a live session under load',
+            5: 'of it: live under load, which takes minutes: `./trainer bench same-cut BAG`',
             7: 'it takes minutes: `./trainer validate`',
             8: 'the pieces are not measured here',
             9: 'it takes a quiet machine: `./trainer bench speed`',

@@ -6,6 +6,7 @@
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -14,17 +15,21 @@ import numpy as np
 from rich.console import Console
 
 from bench.speed.frame import FRAME_PERIOD_MS
+from cutting_trainer.cutting.cut_invariants import cut_face_area
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
 from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
 from cutting_trainer.recordings.incision_metrics import planned_paths
 from cutting_trainer.session.in_process import InProcess, Tissue, make_force_path
-from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.session.scene_overrides import parse_changes, write_changed
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.tool import ContactState, CutOutcome, Frame, ToolContact
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.mesh.topology import CUT
 
+Pose = tuple[np.ndarray, np.ndarray]
+"""Position [m], shape (3,), and orientation as quaternion x y z w, shape (4,)."""
 _MS = 1_000_000
 
 
@@ -107,30 +112,39 @@ def run_script(name: str, changes: dict[str, str]) -> tuple[Frames, list[str]]:
     tissue = _Timed(simulation, make_method(scene.cutting))
     tissue.frames = Frames()
     session = InProcess(make_force_path(scene), tissue, scene.tissue.integration.rate)
-    settings = scene.arm.require_script()
-    script = compile_script(settings, scene.device.tissue_from_device)
-    arm = EmulatedArm(scene.arm, EmulatedHand(scene.arm.hand, script))
-    arm.script_running = True
-    for tick in range(1, round(1000 * script.seconds) + 1):
-        tissue.phase = script.phase_at(tick / 1000)[0]
-        wrench = session.tick(arm.position, arm.orientation).wrench
-        arm.command(tick * _MS, wrench[:3], tick * _MS)
-        arm.advance(tick * _MS, enabled=True)
-    mesh = simulation.mesh
-    cut = mesh.triangles[mesh.triangle_kind == 1]
-    corners = mesh.rest[cut]
-    area = (
-        0.25
-        * np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        ).sum()
-    )
+    for tissue.phase, _ in script_ticks(scene, session):
+        pass
+    area = cut_face_area(simulation.mesh)
     said = [f'cut {simulation.elements_cut} elements, incision {1e4 * area:.2f} cm^2']
     frames = tissue.frames
-    frames.opened = [_opened(corners, path) for path in planned_paths(settings)]
+    frames.opened = opened_lines(scene, simulation.mesh)
     for number, share in enumerate(frames.opened, 1):
         said.append(f'line {number}: {share:.0%} of its length is opened')
     return frames, said
+
+
+def script_ticks(scene: Scene, session: InProcess) -> Iterator[tuple[str, Pose]]:
+    """Run the script of a scene; before each tick yield its phase, and the pose of the device.
+
+    Args:
+        scene: with a script.
+        session: before its first tick.
+    """
+    script = compile_script(scene.arm.require_script(), scene.device.tissue_from_device)
+    arm = EmulatedArm(scene.arm, EmulatedHand(scene.arm.hand, script))
+    arm.script_running = True
+    for tick in range(1, round(1000 * script.seconds) + 1):
+        pose = np.array(arm.position), np.array(arm.orientation)
+        yield script.phase_at(tick / 1000)[0], pose
+        wrench = session.tick(*pose).wrench
+        arm.command(tick * _MS, wrench[:3], tick * _MS)
+        arm.advance(tick * _MS, enabled=True)
+
+
+def opened_lines(scene: Scene, mesh: TetMesh) -> list[float]:
+    """Return which share of each planned line of a script is opened."""
+    corners = mesh.rest[mesh.triangles[mesh.triangle_kind == CUT]]
+    return [_opened(corners, path) for path in planned_paths(scene.arm.require_script())]
 
 
 def _opened(corners: np.ndarray, path: np.ndarray) -> float:
