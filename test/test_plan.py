@@ -183,6 +183,21 @@ def far_task(error: float) -> tuple[Task, Candidate]:
     return task, Candidate('linear_smoothed', 'symplectic_euler', at_rest, Cost(20, 1e-3, 1.0, 0))
 
 
+def test_cuts_save_no_substep_where_the_mesh_itself_was_slowed_down() -> None:
+    """The mass that a growth below 1 adds to the mesh is in the measured cost already."""
+    task = make_task(load_scene('palpation').tissue)
+    at_rest = ErrorEstimate(0.0, 0.0, 0.0)
+    candidate = Candidate('linear', 'symplectic_euler', at_rest, Cost(20, 1e-3, 1e-3, 1e-4))
+    budget = task.budget.model_copy(update={'cuts': True})
+
+    def worst(growth: float) -> Cost:
+        stepping = replace(task.stepping, frequency_growth=growth)
+        return replace(task, budget=budget, stepping=stepping).worst(candidate)
+
+    assert worst(0.7) == worst(1.0) == candidate.cost
+    assert worst(1.5).substeps == 30
+
+
 def test_a_far_field_has_the_fewest_nodes_that_are_accurate_enough() -> None:
     found = []
     for allowed in (0.35, 0.105):

@@ -230,14 +230,11 @@ class TissueSimNode(ManagedNode):
         now = self._governor.concession
         if now == before:
             return
-        share = round(100 * SHARES[now])
         if now > before:
-            self.get_logger().warning(
-                f'frames come late: {share} % of the chosen nodes move on their own from now on, '
-                'until there is time again'
-            )
+            said = f'frames come late: {_moving(now)} from now on, until there is time again'
+            self.get_logger().warning(said)
         else:
-            self.get_logger().info(f'frames are in time: {share} % of the chosen nodes again')
+            self.get_logger().info(f'frames are in time: {_moving(now)} again')
 
     def _tell_pieces(self, frame: Frame) -> None:
         """Publish the pieces that came off, once the blade has left the tissue."""
@@ -368,11 +365,15 @@ class TissueSimNode(ManagedNode):
         if self._plan and self._plan.unmet:
             return DiagnosticStatus.WARN, self._plan.unmet, values
         if frame.concession:
-            share = round(100 * SHARES[frame.concession])
-            said = f'frames come late: {share} % of the chosen nodes move on their own'
+            said = f'frames come late: {_moving(frame.concession)}'
             return DiagnosticStatus.WARN, said, values
         said = frame.state.name.lower() if frame.state else 'no contact'
         return DiagnosticStatus.OK, said, values
+
+
+def _moving(concession: int) -> str:
+    """Return the part of a sentence on the nodes that a concession leaves free."""
+    return f'{round(100 * SHARES[concession])} % of the chosen nodes move on their own'
 
 
 def main() -> None:
