@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from scipy.stats import qmc
 
 from cutting_trainer.studies.identification import (
+    MESH_SHARE,
     Linearised,
     Prior,
     deviations,
@@ -114,19 +115,24 @@ class Fit:
             confidence=confidence,
         )
 
-    def with_mesh(self, problem: Linearised, refined: Sequence[Floats]) -> Linearised:
+    def with_mesh(
+        self, problem: Linearised, other: Sequence[Floats], *, is_refined: bool
+    ) -> Linearised:
         """Return the problem with the error of the mesh.
 
         Args:
             problem: without it.
-            refined: forces of each bag on the refined mesh at the solution [N], each (n, 3).
+            other: forces of each bag on the other mesh at the solution [N], each (n, 3).
+            is_refined: the problem is that of the refined mesh, and the other one is coarser.
         """
-        point = self._point(problem.at)
+        point, sign = self._point(problem.at), -1.0 if is_refined else 1.0
         changes = [
-            self._weighted(bag, forces - self._known[bag, point])
-            for bag, forces in enumerate(refined)
+            sign * self._weighted(bag, forces - self._known[bag, point])
+            for bag, forces in enumerate(other)
         ]
-        return replace(problem, mesh=changes)
+        # What is left of the error of the coarser mesh after one refinement.
+        left = MESH_SHARE - 1.0 if is_refined else MESH_SHARE
+        return replace(problem, mesh=changes, mesh_share=left)
 
     def forces(self, at: Floats) -> list[Floats]:
         """Return the computed forces of all bags [N], each of shape (n, 3)."""

@@ -32,9 +32,9 @@ PARAMETERS = {
     'friction': '-',
 }
 """Constants of `tissue.material` that can be identified, and their units."""
-MESH_PRIOR = (4.0 / 3.0, 2.0 / 3.0)
+MESH_SHARE, MESH_SHARE_SPREAD = 4.0 / 3.0, 2.0 / 3.0
 """Mean and standard deviation of the share of that change: quadratic convergence, and between none
-and linear."""
+and linear. On the refined mesh one whole change less is left."""
 WINDOW_S = 0.05
 MODEL_ERROR = 0.1
 """Error of the model as a share of the force, before its scale is estimated."""
@@ -125,6 +125,7 @@ class Linearised:
         confidence: of the intervals.
         mesh: change of the computed values of each bag by a finer mesh, each shape (m,); (): not
             known.
+        mesh_share: mean share of that change by which the computed values are off.
     """
 
     names: tuple[str, ...]
@@ -135,13 +136,14 @@ class Linearised:
     prior_spread: Floats
     confidence: float = 0.95
     mesh: Sequence[Floats] = ()
+    mesh_share: float = MESH_SHARE
 
     @cached_property
     def _white(self) -> tuple[list[Floats], list[Floats], float]:
         """Residuals and Jacobians without the error of the mesh, and the variance of a residual."""
         raw = list(self.residuals)
         if self.mesh:
-            raw = [r - MESH_PRIOR[0] * of for r, of in zip(raw, self.mesh, strict=True)]
+            raw = [r - self.mesh_share * of for r, of in zip(raw, self.mesh, strict=True)]
         residuals, jacobians, scale = raw, list(self.jacobians), _variance(raw, len(self.names))
         for _ in range(_SCALE_ROUNDS):
             if self.mesh:
@@ -237,7 +239,7 @@ def _without(values: Floats, change: Floats, scale: float) -> Floats:
     size = float(change @ change)
     if size == 0.0:
         return values
-    taken = 1.0 - 1.0 / np.sqrt(1.0 + MESH_PRIOR[1] ** 2 * size / scale)
+    taken = 1.0 - 1.0 / np.sqrt(1.0 + MESH_SHARE_SPREAD**2 * size / scale)
     along = change / np.sqrt(size)
     return np.asarray(values - taken * np.multiply.outer(along, along @ values), float)
 

@@ -55,6 +55,7 @@ class IdentifyOptions:
         parameters: names of the constants; (): those that the scene has and hands may touch.
         noise: of the force for one sample of one component [N].
         changes: of the scene, by dotted key, in YAML.
+        refine: compute on the mesh refined once, and once more on the recorded one.
         workers: number of own workers; 0: one for each processor.
         scheduler: address of a scheduler with workers; '': own workers.
         as_json: print the outcome as JSON.
@@ -65,6 +66,7 @@ class IdentifyOptions:
     parameters: tuple[str, ...] = ()
     noise: float = 0.003
     changes: Mapping[str, str] = field(default_factory=dict)
+    refine: bool = False
     workers: int = 0
     scheduler: str = ''
     as_json: bool = False
@@ -161,15 +163,18 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         name for name in PARAMETERS if getattr(material, name) > 0.0
     )
     priors = {name: prior_of(name, getattr(material, name)) for name in names}
-    running = _Running(bags, names, changes, client)
+    folder = options.output.resolve()
+    recordings = [read_recording(str(bag.path), bag.hash) for bag in bags]
+    refined = [write_refined(of.bag, folder, options.changes) for of in recordings]
+    running = _Running(bags, names, changes, client, refined, on_refined=options.refine)
     fit = Fit(observations, priors, options.noise, running.compute)
     with np.errstate(divide='ignore'):
         recorded = np.log([getattr(material, name) for name in names])
     problem = fit.solve(recorded, confidence=0.95)
-    refined, without = running.refined(problem.at, options.output, options.changes)
+    other, without = running.on_other_mesh(problem.at)
     notes = [without] if without else []
     if not without:
-        problem = fit.with_mesh(problem, refined)
+        problem = fit.with_mesh(problem, other, is_refined=options.refine)
     forces = fit.forces(problem.at)
     return Identification(
         estimates=estimates_of(problem, priors),
@@ -191,35 +196,29 @@ class _Running:
         names: Sequence[str],
         changes: Mapping[str, Any],
         client: Any,
+        refined: Sequence[Path],
+        *,
+        on_refined: bool,
     ) -> None:
         self.computed, self.cpu = 0, 0.0
         self._bags, self._names, self._changes, self._client = bags, names, changes, client
+        self._refined, self._on_refined = refined, on_refined
         self._reasons: dict[str, int] = {}
 
     def compute(self, wanted: Iterable[tuple[int, Point]]) -> dict[tuple[int, Point], Floats]:
         """Return computed forces by bag and point, NaN where they cannot be computed."""
-        settings = {
-            (bag, point): {**self._changes, **self._constants(point)} for bag, point in wanted
-        }
-        return self._series(settings)
+        return self._series(wanted, self._on_refined)
 
-    def refined(
-        self, at: Floats, folder: Path, changes: Mapping[str, str]
-    ) -> tuple[list[Floats], str]:
-        """Return the forces of all bags on refined meshes, and why there are none, or ''."""
+    def on_other_mesh(self, at: Floats) -> tuple[list[Floats], str]:
+        """Return the forces of all bags on the mesh that is not searched on, refined or as
+        recorded, and why there are none, or ''.
+        """
         point = tuple(np.exp(at).tolist())
-        settings = {}
-        for number, bag in enumerate(self._bags):
-            recording = read_recording(str(bag.path), bag.hash)
-            mesh = write_refined(recording.bag, folder.resolve(), changes)
-            settings[number, point] = {**self._changes, **self._constants(point)} | {
-                _MESH_KEY: str(mesh)
-            }
-        found = self._series(settings)
+        found = self._series([(i, point) for i in range(len(self._bags))], not self._on_refined)
         forces = [found[number, point] for number in range(len(self._bags))]
         if any(np.isnan(each).any() for each in forces):
             return [], (
-                'on the refined mesh some bags could not be computed: intervals are without the '
+                'on the other mesh some bags could not be computed: intervals are without the '
                 'error of the mesh'
             )
         return forces, ''
@@ -231,19 +230,20 @@ class _Running:
             for reason, count in self._reasons.items()
         ]
 
-    def _constants(self, point: Point) -> dict[str, Any]:
+    def _changed(self, bag: int, point: Point, refined: bool) -> dict[str, Any]:
         pairs = zip(self._names, point, strict=True)
-        return {f'{_KEY}.{name}': value for name, value in pairs}
+        mesh = {_MESH_KEY: str(self._refined[bag])} if refined else {}
+        return {**self._changes, **{f'{_KEY}.{name}': value for name, value in pairs}, **mesh}
 
     def _series(
-        self, settings: Mapping[tuple[int, Point], Mapping[str, Any]]
+        self, wanted: Iterable[tuple[int, Point]], refined: bool
     ) -> dict[tuple[int, Point], Floats]:
         from cutting_trainer.studies.cluster import compute
 
         here, keys, jobs = identity_of_worker(), {}, []
-        for number, (key, changes) in enumerate(settings.items(), 1):
+        for number, key in enumerate(wanted, 1):
             bag = self._bags[key[0]]
-            setting = Setting(number, dict(changes))
+            setting = Setting(number, self._changed(*key, refined))
             keys[bag.hash, setting.identity] = key
             jobs.append(Job(str(bag.path), bag.hash, setting, here, series=True))
         found = {}

@@ -3,8 +3,9 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ def law(bag: int, modulus: float, toughness: float) -> np.ndarray:
     return np.stack([cut, 0.0 * cut, press], axis=1)
 
 
-def compute(wanted: Iterable[tuple[int, tuple[float, ...]]]) -> dict:
+def compute(wanted: Iterable[tuple[int, tuple[float, ...]]], law: Callable = law) -> dict:
     return {(bag, point): law(bag, *point) for bag, point in wanted}
 
 
@@ -107,6 +108,24 @@ def test_an_error_along_the_change_by_the_mesh_widens_the_interval_and_is_taken_
     assert across.covariance[0, 0] == pytest.approx(plain.covariance[0, 0], rel=0.05)
     shifted = replace(across, residuals=[r + 4 / 3 * other for r in plain.residuals])
     assert shifted.estimates == pytest.approx(plain.estimates, abs=0.02)
+
+
+def test_the_mesh_leaves_a_third_of_its_change_after_one_refinement() -> None:
+    def coarse(bag: int, modulus: float, toughness: float) -> np.ndarray:
+        return law(bag, modulus, toughness) * (1.0 + 0.04 * np.sin(5.0 * TIMES)[:, None])
+
+    exact, refined = law, lambda *of: 0.25 * coarse(*of) + 0.75 * law(*of)  # quadratic
+    observed = [Observation(TIMES, exact(bag, *TRUTH.values())) for bag in range(4)]
+    for searched, other, is_refined in ((coarse, refined, False), (refined, coarse, True)):
+        fit = Fit(observed, PRIORS, NOISE, partial(compute, law=searched))
+        found = fit.solve(np.log([3000.0, 400.0]), 0.95)
+        forces = [other(bag, *np.exp(found.at)) for bag in range(4)]
+        found = fit.with_mesh(found, forces, is_refined=is_refined)
+        left = np.concatenate([
+            r - found.mesh_share * change
+            for r, change in zip(found.residuals, found.mesh, strict=True)
+        ])  # fmt: skip
+        assert np.abs(left).max() < 0.1 * np.abs(np.concatenate(found.residuals)).max()
 
 
 def test_bags_that_say_nothing_leave_the_prior() -> None:

@@ -181,7 +181,12 @@ def _weighted(observed: Observation, noise: Floats) -> Floats:
 
 
 def trial(
-    seed: int, folder: Path, client: object, hands: tuple[str, ...] = HANDS
+    seed: int,
+    folder: Path,
+    client: object,
+    hands: tuple[str, ...] = HANDS,
+    *,
+    refine: bool = False,
 ) -> tuple[dict[str, float], Identification]:
     """Emulate bags of one material and identify it; return the truth and the outcome."""
     random = np.random.default_rng(seed)
@@ -194,9 +199,8 @@ def trial(
     moved = MOVED if len(hands) > 2 else 0.0
     for number, hand in enumerate(hands):
         emulate(SAMPLES / hand, folder / f'bag_{number}', fine, truth, random, moved)
-    options = IdentifyOptions(
-        (str(folder),), folder, tuple(RANGES), NOISE, {'tissue.mesh': str(coarse)}
-    )
+    changes = {'tissue.mesh': str(coarse)}
+    options = IdentifyOptions((str(folder),), folder, tuple(RANGES), NOISE, changes, refine)
     return truth, identify(find_bags(options.bags, folder), options, client)
 
 
@@ -215,6 +219,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description='Trials of ./trainer identify.')
     parser.add_argument('--trials', type=int, default=10)
     parser.add_argument('--first', type=int, default=1, help='seed of the first trial')
+    parser.add_argument('--refine', action='store_true', help='as the option of identify')
+    parser.add_argument('--hands', nargs='+', default=HANDS, help='sample bags, one each hand')
     options = parser.parse_args(arguments)
     warm_up()
     every: dict[str, list[tuple[float, float, bool]]] = {name: [] for name in RANGES}
@@ -222,7 +228,9 @@ def main(arguments: list[str] | None = None) -> int:
         for seed in range(options.first, options.first + options.trials):
             began = time.monotonic()
             with tempfile.TemporaryDirectory() as folder:
-                truth, found = trial(seed, Path(folder), client)
+                truth, found = trial(
+                    seed, Path(folder), client, tuple(options.hands), refine=options.refine
+                )
             random = np.random.default_rng([seed, 1])
             problems = [found.problem, *further_draws(found, random, DRAWS - 1)]
             judged = [_judge(truth, problem) for problem in problems]
