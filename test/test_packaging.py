@@ -140,7 +140,8 @@ def test_no_library_is_installed_with_the_product_that_only_the_checkout_needs()
 
 @pytest.mark.parametrize('folder', ['test', 'bench'])
 def test_every_library_that_tests_and_measurements_import_is_pinned(folder: str) -> None:
-    peers = {'mujoco', 'newton', 'warp'} if folder == 'bench' else set()  # optional, their own list
+    own_lists = {'mujoco', 'newton', 'warp', 'lerobot'}  # optional, of environments of their own
+    peers = own_lists if folder == 'bench' else set()
     lists = ('requirements.txt', 'requirements-test.txt', 'requirements-study.txt')
     known = set().union(*map(pins, lists), peers)
     assert imported_by(folder) <= known
