@@ -1,4 +1,4 @@
-"""Jaws of the device's instrument, whose angle says what the tool is."""
+"""Jaws of the device's instrument: their angle chooses the mode of the tool."""
 
 import math
 from collections.abc import Callable

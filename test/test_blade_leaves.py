@@ -1,4 +1,4 @@
-"""What the edge sweeps in the tissue is paid for and asked for, up to where it leaves."""
+"""Each sweep of the edge in the tissue is paid for and asked for, up to where it leaves."""
 
 from dataclasses import replace
 

@@ -57,7 +57,7 @@ def read_by_lerobot(python: Path, root: Path, cache: Path) -> dict[str, Any]:
     Args:
         python: of LeRobot's environment.
         root: folder of the data set.
-        cache: folder for what the loader keeps.
+        cache: folder of the loader.
     """
     environment = {**os.environ, 'HF_HUB_OFFLINE': '1', 'HF_HOME': str(cache)}
     environment.pop('PYTHONPATH', None)
