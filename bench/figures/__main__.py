@@ -41,8 +41,8 @@ SUBJECTS = {
         },
     ),
     'blade': Subject(
-        modules=('blade_severance', 'blade_law', 'blade_contact'),
-        together=('blade_phases',),
+        modules=(),
+        together=('blade_phases', 'blade_severance', 'blade_law', 'blade_contact'),
         not_covered={
             3: 'of the law: edge, spine and flat do not differ',
             4: 'the force in the hand is not measured here',

@@ -8,8 +8,8 @@ from cutting_trainer.session.in_process import InProcess, Tissue, make_force_pat
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 
-_PHASES = (0, 8, 16, 25)
-"""[ms] by which the frames begin later."""
+_PHASES = (0, 11, 22)
+"""[ms] by which the frames begin later: thirds of a frame."""
 _FRAMES = 100
 """[ms] of three frames, by which the hand waits in phase 0."""
 
@@ -22,7 +22,7 @@ def measure() -> list[Figure]:
     areas, count = [area for area, _ in runs], len(runs)
     spread = (max(areas) - min(areas)) * count / sum(areas)
     least = min(share for _, lines in runs for share in lines)
-    name = 'one hand, frames begun up to 25 ms later: difference of opened areas over their mean'
+    name = 'one hand, frames begun up to 22 ms later: difference of opened areas over their mean'
     return [
         Figure(5, name, spread, 0.01, 'at most', '', count),
         Figure(5, 'the same, share of a line opened, least', least, 0.95, 'at least', '', count),
