@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,10 @@ from cutting_trainer.tissue_sim.mesh.topology import CUT
 Pose = tuple[np.ndarray, np.ndarray]
 """Position [m], shape (3,), and orientation as quaternion x y z w, shape (4,)."""
 _MS = 1_000_000
+_SAMPLES = 100
+"""Points of a planned line."""
+_NEAR_M = 1.5e-3
+_TINY = 1e-30
 
 
 @dataclass
@@ -148,17 +151,24 @@ def opened_lines(scene: Scene, mesh: TetMesh) -> list[float]:
 
 
 def _opened(corners: np.ndarray, path: np.ndarray) -> float:
-    """Return the share of a planned line within 1.5 mm of cut faces, seen along z."""
-    ends = path[1:, :2]
-    ends = np.concatenate([ends[:1], ends])
-    points = np.concatenate(
-        [a + np.linspace(0, 1, 20)[:, None] * (b - a) for a, b in pairwise(ends)]
-    )
-    if not len(corners):
-        return 0.0
-    middles = corners.mean(axis=1)[:, :2]
-    near = np.linalg.norm(points[:, None] - middles[None], axis=2).min(axis=1) < 0.003
-    return float(near.mean())
+    """Return the share of a planned line within 1.5 mm of cut faces, seen along z.
+
+    Faces of a cut are upright: seen along z they are their edges.
+
+    Args:
+        corners: of the faces [m], shape (k, 3, 3).
+        path: corners of the line [m], shape (j, 3).
+    """
+    reached = np.cumsum([0.0, *np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)])
+    at = np.linspace(0.0, reached[-1], _SAMPLES)
+    points = np.column_stack([np.interp(at, reached, path[:, axis]) for axis in (0, 1)])
+    starts = corners[:, :, :2].reshape(-1, 2)
+    edges = np.roll(corners, -1, axis=1)[:, :, :2].reshape(-1, 2) - starts
+    from_start = points[:, None] - starts
+    shares = (from_start * edges).sum(axis=2) / np.maximum((edges**2).sum(axis=1), _TINY)
+    away = from_start - np.clip(shares, 0.0, 1.0)[..., None] * edges
+    distances = np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf)
+    return float((distances < _NEAR_M).mean())
 
 
 def main() -> None:
