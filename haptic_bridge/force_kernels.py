@@ -230,7 +230,7 @@ def take_pose(
 ) -> int:
     """Check a device pose and write it to the state; one that fails changes nothing.
 
-    Arguments after the state, and what is returned, are those of `MotionGate.judge`.
+    Arguments after the state, and what is returned, are those of `motion_gate.judge`.
     """
     code = judge(gate, values, stamp_ns, known)
     if code == safety.OK:

@@ -15,7 +15,7 @@ import numpy as np
 from cutting_trainer.haptic_bridge import extrapolation, force_kernels, safety
 from cutting_trainer.haptic_bridge.contact_plausibility import MAX_STEP_AHEAD, ContactPlausibility
 from cutting_trainer.haptic_bridge.contact_values import NOWHERE, ContactReport, Tick
-from cutting_trainer.haptic_bridge.devices.motion_gate import MotionGate
+from cutting_trainer.haptic_bridge.devices.motion_gate import GATE
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
 from cutting_trainer.haptic_bridge.hand_coupling import HandCoupling
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import surface_stiffness
@@ -119,7 +119,7 @@ class ForcePath:
         self._number = number
         self._report = ContactReport(tool.coupling_stiffness, tool.radius, number)
         self._pose = np.zeros(7)
-        self._motion = MotionGate()
+        self._gate = np.zeros(1, GATE)
         self._pose_stamp = self._pose_ns = 0
         self._sample_ns = self._current_ns = self._start_ns = self._last_ns = 0
         self._step = self._sample_revision = -1
@@ -256,7 +256,7 @@ class ForcePath:
             self.rejections.add(POSE, _OUTDATED if pose.stamp_ns else _INVALID)
             return ''
         self._pose[:] = pose.values
-        setup, gate = self.coupling.setup, self._motion.gate
+        setup, gate = self.coupling.setup, self._gate
         code = force_kernels.take_pose(
             setup, self._state, gate, self._pose, pose.stamp_ns, known and enabled
         )

@@ -12,31 +12,23 @@ GATE = record_type(
 )
 
 
-class MotionGate:
-    """Checks each pose, and compares it with the one before and one some milliseconds earlier.
-
-    Two stamps of a 1 kHz stream can be closer than the motion between them took, so that a step
-    counts as at least `NOMINAL_PERIOD` long. Over a few poses such steps add up: there the stamps
-    are trusted but for one period.
-    """
-
-    def __init__(self) -> None:
-        self.gate = np.zeros(1, GATE)
-
-    def judge(self, pose: np.ndarray, stamp_ns: int, *, known: bool) -> int:
-        """Return OK or a key of `safety.POSE_FAULTS`; a pose that is OK becomes the one before.
-
-        Args:
-            pose: position [m] and quaternion x y z w, shape (7,).
-            stamp_ns: of the pose [ns], later than the one before.
-            known: the pose before is that of the same motion.
-        """
-        return int(judge(self.gate, pose, stamp_ns, known))
-
-
 @kernel(nogil=True)
 def judge(gate: np.ndarray, pose: np.ndarray, stamp_ns: int, known: bool) -> int:
-    """Judge a pose as `MotionGate.judge` does; gate: dtype GATE, shape (1,)."""
+    """Compare a pose with the one before and one some milliseconds earlier.
+
+    Two stamps of a 1 kHz stream can be closer than the motion between them took, so that a step
+    counts as at least `NOMINAL_PERIOD_S` long. Over a few poses such steps add up: there the stamps
+    are trusted but for one period.
+
+    Args:
+        gate: dtype GATE, shape (1,), zero at first; a pose that is OK becomes the one before.
+        pose: position [m] and quaternion x y z w, shape (7,).
+        stamp_ns: of the pose [ns], later than the one before.
+        known: the pose before is that of the same motion.
+
+    Returns:
+        OK or a key of `safety.POSE_FAULTS`.
+    """
     g = gate[0]
     code = safety.pose_gate(pose[:3], pose[3:])
     if code != safety.OK:
