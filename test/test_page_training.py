@@ -34,7 +34,7 @@ ATTEMPTS = ('good', 'bad')
 
 @pytest.fixture(scope='module')
 def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """Two attempts at each exercise; what the page says, lists, and shows of two of them."""
+    """Two attempts at each exercise here; what the page says, lists, and shows of two of them."""
     folder, known = tmp_path_factory.mktemp('training'), sessions()
     view = View(folder, write_scene(folder, two_presses(), 20.0, cut_threshold=0.2))
     found: dict[str, Any] = {}

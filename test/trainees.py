@@ -1,4 +1,4 @@
-"""Trainees with a mouse: the strokes of a good and of a bad attempt at each exercise."""
+"""Trainees with a mouse: the strokes of a good and of a bad attempt at an exercise."""
 
 import time
 from collections.abc import Sequence
@@ -38,13 +38,6 @@ def line(*corners: tuple[float, float, float], count: int = 12) -> np.ndarray:
     return np.linspace(*np.array(corners), count)
 
 
-def ring(radii: tuple[float, float], height: float, turns: float, count: int = 40) -> np.ndarray:
-    """Places along an ellipse from its right end [m]."""
-    angles = np.linspace(0, 2 * np.pi * turns, round(count * turns) + 1)
-    x, y = radii[0] * np.cos(angles), radii[1] * np.sin(angles)
-    return np.column_stack([x, y, np.full(len(x), height)])
-
-
 def presses(*places: tuple[float, float]) -> list[np.ndarray]:
     """Strokes that stay at a place of the block of the lumps [m]."""
     return [np.array([[x, y, 0.024]]) for x, y in places]
@@ -52,23 +45,6 @@ def presses(*places: tuple[float, float]) -> list[np.ndarray]:
 
 OPENED, MARKED = 'target that is opened', 'lumps marked'
 EXERCISES = {
-    # Targets of the sheets are stretched with them.
-    'circle': Exercise(
-        [ring((0.02625, 0.02625), 0.004, 1.05)], [ring((0.02625, 0.02625), 0.004, 0.5)], OPENED
-    ),
-    'pad': Exercise(
-        [line((-0.018, 0, 0.014), (0.0285, 0, 0.014))],
-        [line((-0.018, 0, 0.014), (0.0, 0, 0.014))],
-        OPENED,
-    ),
-    'excision': Exercise(
-        [
-            ring((0.01696, 0.01144), 0.004, 1.05),
-            line((0.0144, -0.0014, 0.004), (0.021, -0.002, 0.004)),
-        ],
-        [ring((0.01696, 0.01144), 0.004, 0.5)],
-        OPENED,
-    ),
     'lumps': Exercise(
         presses((-0.015, -0.012), (0.018, -0.003), (-0.006, 0.018)),
         presses((0.018, -0.003), (0.012, 0.018)),
