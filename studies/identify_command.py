@@ -164,8 +164,10 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
     )
     priors = {name: prior_of(name, getattr(material, name)) for name in names}
     folder = options.output.resolve()
-    recordings = [read_recording(str(bag.path), bag.hash) for bag in bags]
-    refined = [write_refined(of.bag, folder, options.changes) for of in recordings]
+    refined = [
+        write_refined(read_recording(str(bag.path), bag.hash).bag, folder, options.changes)
+        for bag in bags
+    ]
     running = _Running(bags, names, changes, client, refined, on_refined=options.refine)
     fit = Fit(observations, priors, options.noise, running.compute)
     with np.errstate(divide='ignore'):
