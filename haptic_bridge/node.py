@@ -59,6 +59,7 @@ from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
+from cutting_trainer.tissue_sim.streaming.reset_client import ResetClient
 
 MESH_POLL_PERIOD_S = 0.003
 """[s] between two polls for a mesh of the simulation, while one is due."""
@@ -170,6 +171,10 @@ class HapticBridge(ManagedNode):
         self._mode_button = None
         if device.mode_button is not None:
             self._mode_button = DeviceButton(self, BUTTON, device.mode_button, self._change_mode)
+        self._reset_button = None
+        if device.reset_button is not None:
+            self._resetter = ResetClient(self, self.get_logger().warning)
+            self._reset_button = DeviceButton(self, BUTTON, device.reset_button, self._reset_tissue)
         self._jaw = None
         if device.jaw_closed is not None:
             self._jaw = DeviceJaw(self, device.jaw_closed, self._change_jaw)
@@ -270,6 +275,11 @@ class HapticBridge(ManagedNode):
         """Make a palpator of the scalpel, or close the jaws of a grasper, and back."""
         if pressed:
             self._set_mode(self._path.next_mode.other)
+
+    def _reset_tissue(self, pressed: bool) -> None:
+        """Ask for the whole tissue; force and E-STOP stay as they are."""
+        if pressed:
+            self._resetter.ask()
 
     def _change_jaw(self, closed: bool) -> None:
         """Make of the tool what it is with its jaws closed, or open."""

@@ -131,6 +131,13 @@ class DeviceSettings(SceneModel):
         description='index into buttons of arm/button that makes a palpator of the scalpel, or '
         'closes the jaws of a grasper, or back',
     )
+    reset_button: int | None = Field(
+        None,
+        ge=0,
+        le=31,
+        description='index into buttons of arm/button that makes the tissue whole again; an E-STOP '
+        'stays',
+    )
     clutch_button: int | None = Field(
         None,
         ge=0,

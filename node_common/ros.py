@@ -24,6 +24,7 @@ FRAME = TISSUE_FRAME
 MESH = 'tissue/mesh'
 MESH_UPDATES = 'tissue/mesh_updates'
 GET_MESH = 'tissue/get_mesh'
+RESET_TISSUE = 'tissue/reset'
 FORCE = 'tissue/force'
 FRAME_INPUTS = 'tissue/frame_inputs'
 PIECES = 'tissue/pieces'

@@ -188,8 +188,8 @@ def verdict(result: Comparison, took: float, code: CodeIdentity | None) -> list[
         lines.append(f'in the bag twice, and passed over: {result.doubled} messages')
     if result.restart is not None:
         lines.append(
-            f'not compared: tissue_sim was started again, from frame {result.restart.step} '
-            f'({result.restart.seconds:.2f} s) on, at a state that the bag does not have'
+            f'not compared: the tissue began again, at frame {result.restart.step} '
+            f'({result.restart.seconds:.2f} s)'
         )
     if result.difference is None:
         whole = 'identical'

@@ -29,7 +29,10 @@ SESSION_PUBLISHERS = f'/{ARM_NODE},/{TISSUE_NODE}'
 """Publishers of poses, forces and meshes in a session with the emulated arm."""
 OF_A_TOOL = (ARM_NODE, BRIDGE_NODE)
 """Nodes that each tool has."""
-SHARED = ('tissue/mesh', 'tissue/mesh_updates', 'tissue/get_mesh', 'haptic_bridge/e_stop')
+SHARED = (
+    *('tissue/mesh', 'tissue/mesh_updates', 'tissue/get_mesh', 'tissue/reset'),
+    'haptic_bridge/e_stop',
+)
 """Topics and services of the graph that the bridge of a further tool uses."""
 DEVICE_TOPICS = (
     *('measured_cp', 'servo_cf', 'body/servo_cf', 'spatial/servo_cf'),

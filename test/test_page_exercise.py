@@ -67,7 +67,7 @@ def moment(tip: list[float], contact: int, force: float) -> Moment:
 def attempt_of(scene: str, way: list[tuple[list[float], int, float]]) -> Any:
     """Newest report on an attempt whose tip goes through places, half a second at each."""
     simulation = make_simulation(load_scene(scene).tissue)[0]
-    replica = SimpleNamespace(**replica_fields(simulation.mesh), revision=7, topology=0)
+    replica = SimpleNamespace(**replica_fields(simulation.mesh), step=7, topology=0)
     progress = AttemptProgress(load_scene(scene).exercise)
     content, now = None, 100.0
     for tip, contact, force in way:
@@ -101,7 +101,7 @@ def test_progress_of_an_attempt_is_shown_and_the_score_once_the_tip_is_back() ->
     content = progress.see(now + 1, replica, moment([0.018, 0, 0.040], 0, 0.0))
     assert content is not None and content['score']['passed'] is False
     assert any('target that is opened' in reason for reason in content['score']['reasons'])
-    replica.revision = 0  # a new tissue
+    replica.step = 0  # a new tissue
     content = progress.see(now + 2, replica, moment([-0.018, 0, 0.040], 0, 0.0))
     assert content is not None and content['score'] is None
     assert rows(content)['time'] == ('0 s', False)

@@ -110,7 +110,6 @@ def test_whatever_is_said_becomes_a_message_of_the_list_or_a_refusal(seed: int) 
 @pytest.mark.parametrize(
     ('controls', 'op'),
     [
-        (replace(CONTROLS, session=False), 'reset'),
         (replace(CONTROLS, session=False), 'record'),
         (replace(CONTROLS, session=False), 'choose'),
         (replace(CONTROLS, busy='The nodes start again ...'), 'reset'),

@@ -235,7 +235,7 @@ def test_a_session_in_which_the_simulation_was_started_again_is_compared_up_to_t
     assert stopped.value.code == 0
     said = capsys.readouterr().out
     assert said.startswith(f'identical up to the restart at {result.restart.seconds:.2f} s\n')
-    assert 'not compared: tissue_sim was started again' in said
+    assert 'not compared: the tissue began again' in said
 
 
 def test_a_bag_of_format_2_that_begins_in_the_middle_says_why_it_is_not_computed(

@@ -25,7 +25,15 @@ from bench.page.open_page import OpenPage
 from bench.page.stand_in import sheet
 from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.node_common.qos import EVENTS, LATCHED
-from cutting_trainer.node_common.ros import ARM, DIAGNOSTICS, FRAME, HAND, MESH, Diagnostics
+from cutting_trainer.node_common.ros import (
+    ARM,
+    DIAGNOSTICS,
+    FRAME,
+    HAND,
+    MESH,
+    RESET_TISSUE,
+    Diagnostics,
+)
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.node_commands import (
     BRIDGE_NODE,
@@ -53,7 +61,7 @@ class Graph:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=domain)
         self.node = node = rclpy.create_node('graph', context=self.context)
-        self.stops = self.resets = 0
+        self.stops = self.resets = self.tissues = 0
         self.words: list[str] = []
         self.goals: list[Any] = []
         types = crtk_types()
@@ -69,6 +77,7 @@ class Graph:
             node.create_subscription(types.command, f'{name}/state_command', self._command, EVENTS)
         node.create_subscription(PoseStamped, HAND, self.goals.append, EVENTS)
         node.create_service(Trigger, f'{BRIDGE_NODE}/reset_e_stop', self._reset)
+        node.create_service(Trigger, RESET_TISSUE, self._reset_tissue)
         node.create_timer(0.5, self._speak)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(node)
@@ -105,6 +114,11 @@ class Graph:
         self._stopped.publish(Bool(data=False))
         self.enter('DISABLED')
         response.success = True
+        return response
+
+    def _reset_tissue(self, _: Any, response: Any) -> Any:
+        self.tissues += 1
+        response.message = 'The mesh is gone.'
         return response
 
     def _command(self, message: Any) -> None:
@@ -224,6 +238,25 @@ def test_hand_is_guided_around_the_tissue_while_the_force_is_on(everything: Any)
     time.sleep(0.2)
     assert len(graph.goals) == count
     graph.enter('ENABLED')
+
+
+def test_reset_takes_the_force_away_and_asks_for_the_tissue_or_with_a_bag_the_launcher(
+    everything: Any,
+) -> None:
+    graph, viewer, page = everything
+    words = len(graph.words)
+    page.ask('reset')
+    page.wait(lambda: graph.tissues, 'the reset')
+    page.wait(lambda: 'pause' in graph.words[words:], 'the pause')
+    page.wait(lambda: 'gone' in page.values.get('notice', {}).get('text', ''), 'the reason')
+    viewer.answer(recording='a bag')
+    page.wait(lambda: page.values['session']['recording'], 'the bag')
+    page.ask('reset')
+    page.wait(lambda: viewer.asked[-1] == {'ask': 'restart'}, 'the line')
+    assert graph.tissues == 1
+    viewer.answer()
+    graph.enter('ENABLED')
+    page.wait(lambda: not page.values['session']['recording'], 'the end of the bag')
 
 
 def test_launcher_is_asked_for_what_is_on_offer_and_in_short_lines(everything: Any) -> None:

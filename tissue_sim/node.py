@@ -6,9 +6,11 @@ from pathlib import Path
 from cutting_trainer_msgs.msg import FreePiece, Mesh, MeshDelta, State
 from cutting_trainer_msgs.srv import GetMesh
 from diagnostic_msgs.msg import DiagnosticStatus
+from std_srvs.srv import Trigger
 
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.code_identity import identity_here
+from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.node_common.lifecycle import ManagedNode, Stop, announce_ready, run
 from cutting_trainer.node_common.parameters import (
     announced,
@@ -17,6 +19,7 @@ from cutting_trainer.node_common.parameters import (
     seed_parameter,
 )
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
+from cutting_trainer.node_common.stamps import REVISION_MODULUS
 from cutting_trainer.node_common.timing import (
     FRAME_NICENESS,
     FairLock,
@@ -32,6 +35,7 @@ from cutting_trainer.tissue_sim.planner.monitor import PlanMonitor
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.simulation.checkpoint import Checkpoint, read_checkpoint
 from cutting_trainer.tissue_sim.simulation.governor import Governor
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.simulation.state import state_of
 from cutting_trainer.tissue_sim.streaming import messages
 from cutting_trainer.tissue_sim.streaming.cut_client import CutClient
@@ -74,29 +78,34 @@ class TissueSimNode(ManagedNode):
         self._file = Path(file) if file else None
         before = self._tissue_before() if self._resumes else None
         self._checkpoint = Checkpoint(self._file) if self._file else None
-        self._simulation, plan = make_simulation(
-            settings, before, self.get_logger().info, len(labels)
-        )
-        self._plan = None if plan is None else PlanMonitor(plan, self._simulation)
+        simulation, plan = make_simulation(settings, before, self.get_logger().info, len(labels))
+        self._settings, self._found = as_planned(settings, plan), plan
+        self._take(simulation, 0 if before is None else before.revision)
+        self._anew: TissueSimulation | None = None
         self._log_plan()
-        self._announce_method(as_planned(settings, plan))
+        self._announce_method(self._settings)
         text = 'largest data rate of meshes and their deltas [bytes/s]; 0: no limit'
         self._link = LinkBudget(
             float(parameter(self, 'mesh_bandwidth', 0.0, text, within=(0.0, 1e12)))
         )
-        rate = settings.integration.rate
-        self._loop = PeriodicLoop(rate)
-        self._governor = Governor(1 / rate, self._simulation.dynamics.possible_concessions)
-        self._encoder = messages.DeltaEncoder(self._simulation.mesh, self._simulation.displacement)
-        self._encoder.revision = 0 if before is None else before.revision
-        self._pieces = PieceRegister(self._simulation.mesh)
-        self._looked_at = self._simulation.mesh.topology
+        self._loop = PeriodicLoop(settings.integration.rate)
         self._lock = FairLock()
         self._next_keyframe = self._next_checkpoint = 0.0
-        self._frame: Frame | None = None
         self._ticked = self._suspects = 0.0
         self._diverged = 0
         self._connect()
+
+    def _take(self, simulation: TissueSimulation, revision: int) -> None:
+        """Use a simulation before its first frame, with the revision of its published mesh."""
+        self._simulation = simulation
+        self._plan = None if self._found is None else PlanMonitor(self._found, simulation)
+        period = 1 / self._settings.integration.rate
+        self._governor = Governor(period, simulation.dynamics.possible_concessions)
+        self._encoder = messages.DeltaEncoder(simulation.mesh, simulation.displacement)
+        self._encoder.revision = revision
+        self._pieces = PieceRegister(simulation.mesh)
+        self._looked_at = simulation.mesh.topology
+        self._frame: Frame | None = None
 
     def _tissue_before(self) -> MeshReplica | None:
         """Return the tissue of the previous node of this name, as its followers know it."""
@@ -138,6 +147,7 @@ class TissueSimNode(ManagedNode):
         self._states = StatePublisher(states)
         service = self.create_service(GetMesh, ros.GET_MESH, self._serve_mesh)
         ros.introspect(self, service, contents=False)  # the bag has whole meshes anyway
+        ros.introspect(self, self.create_service(Trigger, ros.RESET_TISSUE, self._serve_reset))
         self._diagnostics = ros.Diagnostics(self, self._status)
 
     @property
@@ -162,6 +172,8 @@ class TissueSimNode(ManagedNode):
             if stop.is_set():
                 return
             with self._lock:
+                if self._anew is not None:
+                    self._begin_anew(self._anew)
                 self._tick()
             self._govern(time.monotonic() - self._ticked, late)
             self._diagnostics.catch_up()
@@ -289,6 +301,27 @@ class TissueSimNode(ManagedNode):
             response.mesh = self._mesh_message()
         response.success = True
         return response
+
+    def _serve_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Set up the whole tissue, with which the loop goes on."""
+        if not self.is_active:
+            response.message = 'The node tissue_sim is not active: activate it.'
+            return response
+        try:
+            self._anew, _ = make_simulation(self._settings, tools=len(self._tools))
+        except MeshError as error:
+            response.message = f'The mesh of the scene cannot be used any more: {error}.'
+            return response
+        response.success, response.message = True, 'The tissue is whole from its next frame on.'
+        return response
+
+    def _begin_anew(self, simulation: TissueSimulation) -> None:
+        """Go on as a process would that begins with the whole tissue; revisions go on."""
+        self._anew = None
+        self.get_logger().info(f'the tissue is whole again, after frame {self._simulation.step}')
+        self._take(simulation, (self._encoder.revision + 1) % REVISION_MODULUS)
+        self._cuts.follow(simulation)
+        self._publish_keyframe()
 
     def _yield_place(self) -> None:
         """Exit if another node has replaced this one during a stall."""

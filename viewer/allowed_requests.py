@@ -68,10 +68,11 @@ class LiveControls:
     def refused(self) -> dict[str, str]:
         """Return why an op is not allowed whatever its values, by op."""
         found = {}
-        asks_launcher = ('reset', 'record', 'choose', 'attempt', 'watch')
-        if not self.session or self.busy:
-            why = self.busy if self.session else _NO_LAUNCHER
-            found = dict.fromkeys(asks_launcher, why)
+        asks_launcher = ('record', 'choose', 'attempt', 'watch')
+        if not self.session:
+            found = dict.fromkeys(asks_launcher, _NO_LAUNCHER)
+        elif self.busy:
+            found = dict.fromkeys((*asks_launcher, 'reset'), self.busy)
         if self.e_stopped:
             found['start'] = 'An E-STOP holds: reset it first.'
         if not self.can_guide or self.bounds is None:

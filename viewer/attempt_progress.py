@@ -35,7 +35,7 @@ class AttemptProgress:
         self._attempt = Attempt(self._exercise)
         self._motion: list[np.ndarray] = []
         self._forces: list[tuple[float, float]] = []
-        self._revision = self._topology = -1
+        self._step = self._topology = -1
         self._next = 0.0
 
     def see(self, now: float, replica: MeshReplica, moment: Moment) -> dict[str, Any] | None:
@@ -43,12 +43,12 @@ class AttemptProgress:
 
         Args:
             now: [s], monotonic.
-            replica: of the tissue; an older revision than before is a new tissue, and attempt.
+            replica: of the tissue; an older frame than before is of a new tissue, and attempt.
             moment: of the tool, finite.
         """
-        if replica.revision < self._revision:
+        if replica.step < self._step:
             self._begin()
-        self._revision = replica.revision
+        self._step = replica.step
         self._motion.append(np.array([now, *moment.tip, *moment.blade.ravel(), moment.contact]))
         self._forces.append((now, float(np.linalg.norm(moment.force))))
         if now < self._next:

@@ -122,6 +122,11 @@ class LivePage:
         self._notices = 0
         self._hello(None)
 
+    @property
+    def is_recording(self) -> bool:
+        """Whether the launcher has a bag in progress."""
+        return self._controls.recording
+
     def _hello(self, replica: MeshReplica | None) -> None:
         positions = None if replica is None else replica.positions()
         bounds = None if positions is None else reach(positions)

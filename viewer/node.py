@@ -32,6 +32,7 @@ from cutting_trainer.node_common.share_folder import scene_names
 from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.streaming.mesh_follower import MeshFollower
+from cutting_trainer.tissue_sim.streaming.reset_client import ResetClient
 from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, is_local, link, make_gate
 from cutting_trainer.viewer.allowed_requests import LiveControls
 from cutting_trainer.viewer.diagnostics_table import Statuses
@@ -115,10 +116,13 @@ class ViewerNode(ManagedNode):
         # Calls from other threads for the one that updates the page, at its next iteration.
         self._asked = Requests()
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._operation = Operation(
-            self, lambda text: self._calls.put(lambda: self._page.warn(text)), tool_names(scene)
-        )
+
+        def warn(text: str) -> None:
+            self._calls.put(lambda: self._page.warn(text))
+
+        self._operation = Operation(self, warn, tool_names(scene))
         self._open_page()
+        self._resetter = ResetClient(self, warn)
         self._scored = False
         self._loop = PeriodicLoop(RATE_HZ)
         self._next_markers = 0.0
@@ -270,7 +274,7 @@ class ViewerNode(ManagedNode):
             case ResetEStop():
                 self._operation.reset_stop()
             case Reset():
-                self._ask_launcher(ask='restart')
+                self._reset()
             case Record():
                 self._ask_launcher(ask='record', on=message.on)
             case Choose():
@@ -281,6 +285,14 @@ class ViewerNode(ManagedNode):
                 self._ask_launcher(ask='watch', bags=message.bags, number=message.number)
             case Scale():
                 self._scale(message.value)
+
+    def _reset(self) -> None:
+        """Make the tissue whole; with a bag, the launcher ends it and begins another."""
+        if self._page.is_recording:
+            self._ask_launcher(ask='restart')
+            return
+        self._operation.pause()
+        self._resetter.ask()
 
     def _scale(self, value: float) -> None:
         def take(*, holds: bool) -> None:

@@ -87,7 +87,7 @@ class Pause(PageMessage):
 
 
 class Reset(PageMessage):
-    """Restart the nodes, with the whole tissue."""
+    """Make the tissue whole, with the force off."""
 
     op: Literal['reset']
 

@@ -209,6 +209,7 @@ SERVICES = (
     (ros.CUT, f'{OURS}/srv/Cut', 'cutting', 'sweep the blade; `tissue_sim` calls it'),
     (f'{ros.ARM}/operating_state', f'{OURS}/srv/TriggerOperatingState', 'arm', 'CRTK state'),
     (f'{BRIDGE}/operating_state', f'{OURS}/srv/TriggerOperatingState', BRIDGE, 'CRTK state'),
+    (ros.RESET_TISSUE, 'std_srvs/srv/Trigger', TISSUE, 'make the tissue whole again'),
     (f'{BRIDGE}/reset_e_stop', 'std_srvs/srv/Trigger', BRIDGE, 'release E-STOP, into DISABLED'),
     ('NODE/change_state', 'lifecycle_msgs/srv/ChangeState', 'every node', 'its life cycle'),
     ('NODE/get_state', 'lifecycle_msgs/srv/GetState', 'every node', 'where in it the node is'),

@@ -48,6 +48,16 @@ class CutClient:
         self._waited = self._longest = self._total = 0.0
         self._count = 0
 
+    def follow(self, simulation: TissueSimulation) -> None:
+        """Take another simulation, before its first frame; a pending cut is dropped.
+
+        The service drops its stroke when it receives the mesh.
+        """
+        if self._future is not None:
+            self._client.remove_pending_request(self._future)
+        self._future, self._waited = None, 0.0
+        self._simulation, self._transaction = simulation, CutTransaction(simulation)
+
     def ask(self, frame: Frame, revision: int) -> None:
         """Request the cut of a frame, if it has one.
 
