@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cutting_trainer.cutting.cases import NAMES
 from cutting_trainer.cutting.fragments import small_pieces
 from cutting_trainer.cutting.lookup import (
     BLOCKED,
@@ -39,6 +38,7 @@ from cutting_trainer.cutting.state_table import (
     settle_nodes,
 )
 from cutting_trainer.cutting.subdivision import Pieces, spoiled, subdivide
+from cutting_trainer.cutting.subdivision_cases import NAMES
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 
 _CASE_OF_STATE = np.array([CASES.index(name) for name in NAMES])

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cutting_trainer.cutting.cases import MAX_CHILDREN
+from cutting_trainer.cutting.subdivision_cases import MAX_CHILDREN
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
 

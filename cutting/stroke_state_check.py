@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from cutting_trainer.cutting.cases import INSIDE, MAX_CHILDREN, NAMES
 from cutting_trainer.cutting.lookup import EDGES, NODES, PARENTS
+from cutting_trainer.cutting.subdivision_cases import INSIDE, MAX_CHILDREN, NAMES
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.simulation.serialisation import StateError
 from cutting_trainer.tissue_sim.simulation.state_checks import has_room, within

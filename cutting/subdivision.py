@@ -4,7 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cutting_trainer.cutting.cases import (
+from cutting_trainer.cutting.geometry import EDGE_NODES, altitude, height
+from cutting_trainer.cutting.lookup import DONE, PENDING, SNAPPED, edge_key, find_edge, side_of
+from cutting_trainer.cutting.state_table import crossings_of
+from cutting_trainer.cutting.subdivision_cases import (
     CHILDREN,
     FRONT,
     INSIDE,
@@ -14,9 +17,6 @@ from cutting_trainer.cutting.cases import (
     ORDER,
     STATE,
 )
-from cutting_trainer.cutting.geometry import EDGE_NODES, altitude, height
-from cutting_trainer.cutting.lookup import DONE, PENDING, SNAPPED, edge_key, find_edge, side_of
-from cutting_trainer.cutting.state_table import crossings_of
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 

@@ -1,4 +1,4 @@
-"""Measures of a motion: jerk, tremor, rest."""
+"""Jerk, tremor and rest of a motion; path and economy are in `metrics.py`."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -106,7 +106,7 @@ class NodeProcess:
         tail: last lines of its output.
         ready, done: it has reported so.
         asked_to_end: its end is expected from now on.
-        silent: it has closed its output.
+        output_closed: it has closed its output.
         warnings: number of its warnings.
         unread: number of its lines `message: ...` that could not be read.
         beat: time of its last heartbeat, on the supervisor's clock [s].
@@ -122,7 +122,7 @@ class NodeProcess:
         self.command = command
         self.log = _Log(log)
         self.tail: deque[str] = deque(maxlen=MAX_TAIL_LINES)
-        self.ready = self.done = self.asked_to_end = self.silent = False
+        self.ready = self.done = self.asked_to_end = self.output_closed = False
         self.warnings = self.unread = 0
         self.beat = 0.0
         self.hung = False
@@ -212,7 +212,7 @@ class NodeProcess:
             if self._skipping:  # up to the end of the long line
                 self._rest = b''
             if not data:
-                self.silent = True
+                self.output_closed = True
                 return
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from cutting_trainer.session.e_stop_latch import PRESS, PRESSED, EStopState
+from cutting_trainer.session.e_stop_memory import PRESS, PRESSED, EStopState
 from cutting_trainer.session.node_process import (
     NodeCommand,
     NodeProcess,
@@ -251,7 +251,7 @@ class Supervisor:
         self._selector.register(node.pipe, selectors.EVENT_READ, node)
 
     def _close(self, node: NodeProcess) -> None:
-        if not node.silent:
+        if not node.output_closed:
             self._selector.unregister(node.pipe)
         node.close()
 
@@ -304,7 +304,7 @@ class Supervisor:
         return SLOW_NODE_TIMEOUT_S if slow else self._heartbeat_timeout
 
     def _read(self, node: NodeProcess) -> None:
-        if node.silent:
+        if node.output_closed:
             return
         for line in node.lines():
             if line == f'beat: {node.name}':
@@ -314,7 +314,7 @@ class Supervisor:
             if line:
                 node.tail.append(line)
             self._interpret(node, line)
-        if node.silent:
+        if node.output_closed:
             self._selector.unregister(node.pipe)
 
     def _interpret(self, node: NodeProcess, line: str) -> None:

@@ -7,12 +7,12 @@ import pytest
 from meshes import box, irregular_box
 from strokes import draw, mesh_of, method_named, straight, total_area, total_cases
 
-from cutting_trainer.cutting.cases import NAMES, STATE
 from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.cutting.cut_invariants import pieces
 from cutting_trainer.cutting.geometry import smallest_altitudes
 from cutting_trainer.cutting.lookup import EDGES, NODES
 from cutting_trainer.cutting.method_interface import CASES
+from cutting_trainer.cutting.subdivision_cases import NAMES, STATE
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 
 pytestmark = pytest.mark.long

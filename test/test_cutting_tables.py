@@ -7,8 +7,15 @@ from itertools import combinations, permutations, product
 import numpy as np
 import pytest
 
-from cutting_trainer.cutting.cases import CHILDREN, IS_COMPLETE, NAMES, NUMBER, ORDER, STATE
 from cutting_trainer.cutting.geometry import EDGE_NODES
+from cutting_trainer.cutting.subdivision_cases import (
+    CHILDREN,
+    IS_COMPLETE,
+    NAMES,
+    NUMBER,
+    ORDER,
+    STATE,
+)
 
 EDGES = [tuple(int(i) for i in edge) for edge in EDGE_NODES]
 FACES = list(combinations(range(4), 3))

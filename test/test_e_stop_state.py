@@ -11,7 +11,7 @@ import pytest
 
 from cutting_trainer.haptic_bridge import e_stop_topic
 from cutting_trainer.node_common.operating_state import OperatingStateMachine
-from cutting_trainer.session.e_stop_latch import PRESSED, RELEASED, REPEAT_PERIOD_S, EStopState
+from cutting_trainer.session.e_stop_memory import PRESSED, RELEASED, REPEAT_PERIOD_S, EStopState
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.supervisor import Supervisor
 from cutting_trainer.session.terminal_keys import Keys
@@ -25,7 +25,7 @@ def test_a_press_is_told_again_and_again_until_a_node_says_that_it_holds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = 100.0
-    monkeypatch.setattr('cutting_trainer.session.e_stop_latch.time.monotonic', lambda: now)
+    monkeypatch.setattr('cutting_trainer.session.e_stop_memory.time.monotonic', lambda: now)
     state = EStopState([BRIDGE, OTHER], keys=False)
     assert not state.poll()
     state.ask()

@@ -20,7 +20,7 @@ from cutting_trainer.node_common.operating_state import OperatingStateMachine
 from cutting_trainer.node_common.ros import FORCE, FRAME_INPUTS
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.recordings import resimulate_command
-from cutting_trainer.session.e_stop_latch import PRESSED, RELEASED, EStopState
+from cutting_trainer.session.e_stop_memory import PRESSED, RELEASED, EStopState
 from cutting_trainer.session.node_commands import (
     ARM_NODE,
     BRIDGE_NODE,

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from cutting_trainer.cutting.cases import (
+from cutting_trainer.cutting.geometry import EDGE_NODES
+from cutting_trainer.cutting.subdivision_cases import (
     CHILDREN,
     FRONT,
     INSIDE,
@@ -20,7 +21,6 @@ from cutting_trainer.cutting.cases import (
     NUMBER,
     STATE,
 )
-from cutting_trainer.cutting.geometry import EDGE_NODES
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,7 @@
-"""E-STOP in the launcher: its key, its state across restarts, and its delivery to nodes."""
+"""E-STOP in the launcher: its key, its state across restarts, and its delivery to the nodes.
+
+The latch itself is in `node_common/operating_state.py`.
+"""
 
 import time
 from collections.abc import Sequence
