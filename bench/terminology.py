@@ -1,6 +1,7 @@
 """Check the words of the source: names that a standard term replaces, and style of docstrings."""
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,16 +40,19 @@ NAME_PART = re.compile(r'[A-Z]+(?![a-z])|[A-Z]?[a-z]+')
 ALLOWED = frozenset({'most_common', 'EStopKeeper'})
 
 
-def sources() -> Iterator[tuple[Path, ast.Module]]:
-    """Yield the path and the syntax tree of each module of the product and of bench."""
-    for room in ROOMS:
-        for path in sorted((ROOT / room).rglob('*.py')):
-            yield path, ast.parse(path.read_text(encoding='utf-8'))
+@functools.cache
+def sources() -> list[tuple[Path, list[ast.AST]]]:
+    """Return the path and the syntax nodes of each module of the product and of bench."""
+    return [
+        (path, list(ast.walk(ast.parse(path.read_text(encoding='utf-8')))))
+        for room in ROOMS
+        for path in sorted((ROOT / room).rglob('*.py'))
+    ]
 
 
-def names(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def names(nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
     """Yield the line and the name of everything that a module defines."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             yield node.lineno, node.name
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
@@ -58,8 +62,8 @@ def names(tree: ast.Module) -> Iterator[tuple[int, str]]:
 def replaced_names() -> list[str]:
     """Return a sentence for each defined name that has a word of `REPLACED`."""
     found = []
-    for path, tree in sources():
-        for line, name in names(tree):
+    for path, nodes in sources():
+        for line, name in names(nodes):
             if name in ALLOWED:
                 continue
             for part in NAME_PART.findall(name):
@@ -72,8 +76,8 @@ def replaced_names() -> list[str]:
 
 def docstrings() -> Iterator[tuple[str, ast.AST, str]]:
     """Yield the place, the node and the text of each docstring."""
-    for path, tree in sources():
-        for node in ast.walk(tree):
+    for path, nodes in sources():
+        for node in nodes:
             if isinstance(
                 node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
             ) and (text := ast.get_docstring(node)):

@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import rclpy
-from live import PATIENCE, ROOT
+from live import PATIENCE, ROOT, free_domain
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from cutting_trainer.node_common.ros import ARM
 
-DOMAIN = 20 + os.getpid() % 80
+DOMAIN = free_domain()
 MEASURED_CP = f'{ARM}/measured_cp'
 
 

@@ -35,8 +35,13 @@ def joined(*meshes):
 
 def distance(positions, triangles, point):
     """Least distance of a point from triangles [m], by brute force."""
+    return distances(positions, triangles, point).min()
+
+
+def distances(positions, triangles, point):
+    """Distance of a point from each triangle [m], by brute force."""
     a, b, c = (positions[triangles[:, i]] for i in range(3))
-    best = min(_from_segments(p, q, point).min() for p, q in ((a, b), (b, c), (c, a)))
+    edges = [_from_segments(p, q, point) for p, q in ((a, b), (b, c), (c, a))]
     normal = np.cross(b - a, c - a)
     size = np.linalg.norm(normal, axis=1)
     normal = normal / np.where(size > 0, size, 1)[:, None]
@@ -44,7 +49,7 @@ def distance(positions, triangles, point):
     for p, q in ((a, b), (b, c), (c, a)):
         inside &= np.einsum('ij,ij->i', np.cross(normal, q - p), point - p) >= 0
     height = np.abs(np.einsum('ij,ij->i', normal, point - a))
-    return min(best, height[inside].min(initial=np.inf))
+    return np.min([*edges, np.where(inside, height, np.inf)], axis=0)
 
 
 def _from_segments(a, b, point):

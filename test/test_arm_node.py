@@ -17,6 +17,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+from live import free_domain
 from numpy.testing import assert_allclose, assert_array_equal
 
 from cutting_trainer.node_common import qos, ros
@@ -34,7 +35,7 @@ from cutting_trainer.node_common.timing import request_real_time
 pytestmark = pytest.mark.live
 
 ROOT = Path(__file__).resolve().parents[1]
-DOMAIN = 88
+DOMAIN = free_domain()
 STIFFNESS = 400.0
 START, END = (0.01, 0.0, 0.03), (0.01, 0.02, 0.0)
 PUSH = (0.0, 0.6, -0.8)

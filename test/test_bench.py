@@ -37,7 +37,7 @@ def _short() -> None:
 @pytest.mark.parametrize(
     'name',
     [
-        pytest.param(name, marks=pytest.mark.thorough) if name == Part.START else name
+        pytest.param(name, marks=pytest.mark.thorough) if name in (Part.START, Part.FORCE) else name
         for name in Part
     ],
 )

@@ -24,7 +24,7 @@ TURNED_FRAME = Transform(translation=(0.01, 0, 0.02), rotation_rpy_deg=(20, -30,
 @pytest.mark.parametrize(
     ('device', 'force_scale'),
     [
-        (DeviceSettings(), 1.0),
+        pytest.param(DeviceSettings(), 1.0, marks=pytest.mark.thorough),
         (DeviceSettings(tissue_from_device=TURNED_FRAME, force_frame='body'), 0.5),
     ],
     ids=['same axes', 'turned, scaled, body axes'],

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from bridge_world import DEPTH, PRESSED, SCHEDULING, K, Record, World, refused, session
+from live import free_domain
 
 from cutting_trainer.haptic_bridge.force_kernels import NONE
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
@@ -21,7 +22,7 @@ from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedC
 
 pytestmark = pytest.mark.live
 
-DOMAIN = 86
+DOMAIN = free_domain()
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
 device: {profile: dvrk_mtm}

@@ -14,6 +14,7 @@ import pytest
 from bridge_world import DEPTH, PRESSED, K, Record, World, messages, refused, session
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from live import free_domain
 from sensor_msgs.msg import Joy
 
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
@@ -22,7 +23,7 @@ from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedC
 
 pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
-DOMAIN = 85
+DOMAIN = free_domain()
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
 device: {profile: dvrk_mtm, hold_button: true}

@@ -16,13 +16,14 @@ from bridge_world import (
     World,
     session,
 )
+from live import free_domain
 
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec
 
 pytestmark = pytest.mark.live
 
-DOMAIN = 87
+DOMAIN = free_domain()
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
 device: {profile: dvrk_mtm}

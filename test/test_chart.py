@@ -1,6 +1,7 @@
 """The chart: references against formulas, fronts, what it writes; limits of stability."""
 
 import csv
+import functools
 import json
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 pytestmark = pytest.mark.long
 
@@ -76,6 +78,7 @@ def test_loads_and_meshes_of_the_chart_are_what_they_say() -> None:
     np.testing.assert_allclose(end_load(mesh, BEAM, 0.5).sum(axis=0), [0, 0, -0.5], atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_smoothed_strains_cure_the_locking_that_plain_elements_show() -> None:
     problem = Cantilever(0.47)
     # The reference of the full chart; computed there, and here from two coarser grids only.
@@ -117,10 +120,16 @@ def test_only_what_nothing_beats_in_both_is_on_the_front() -> None:
     assert front == [False, False, True, True]
 
 
+@functools.cache
+def charted() -> tuple[list[Point], dict[str, TissueSettings]]:
+    """The points of the chart, and the shipped scenes."""
+    return read_points(Path(__file__).parents[1] / 'docs' / 'charts' / 'points.csv'), scenes()
+
+
 @pytest.mark.parametrize('scene', scenes())
 def test_the_method_of_each_shipped_scene_lies_on_the_front_of_the_chart(scene: str) -> None:
-    points = read_points(Path(__file__).parents[1] / 'docs' / 'charts' / 'points.csv')
-    found = standing(points, scene, scenes()[scene])
+    points, shipped = charted()
+    found = standing(points, scene, shipped[scene])
     assert found and not any(found.values()), found
 
 
@@ -145,6 +154,7 @@ def test_the_cost_of_an_error_is_read_off_the_line_of_a_method() -> None:
     assert '1 % was not reached' in text
 
 
+@pytest.mark.thorough
 def test_page_table_and_a_picture_by_panel_are_written(tmp_path: Path) -> None:
     from dataclasses import replace
 
@@ -176,6 +186,7 @@ def test_peers_that_came_to_rest_are_on_the_cantilevers_eight_curves_at_most() -
     assert not peer_points('indentation')
 
 
+@pytest.mark.thorough
 def test_a_sphere_on_scattered_nodes_is_the_quadratic_one_and_slides_without_ripple() -> None:
     press = FootprintPress().rest('linear_smoothed', 4).errors
     assert press.force < 0.05 and press.displacement < press.force
@@ -194,6 +205,7 @@ def test_the_chart_prints_the_points_for_machines_too(
     assert [Point(**point) for point in told['points']] == POINTS
 
 
+@pytest.mark.thorough
 def test_an_active_region_errs_less_with_a_smaller_tolerance_and_with_more_nodes() -> None:
     problem = LocalPalpation()
     regions = {describe(active): active for active in problem.regions(2)}

@@ -8,7 +8,7 @@ from bench.haptics.comparators import CONTACTS, GodObject, Penalty
 from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.thorough
 
 RADIUS = 1e-3
 

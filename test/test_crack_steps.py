@@ -13,9 +13,8 @@ STEADY = SLICED * DEPTH
 @pytest.mark.parametrize(
     ('cell', 'rate'),
     [
-        (0.004, 20.0),
         (0.0045, 30.0),
-        pytest.param(0.004, 60.0, marks=pytest.mark.thorough),
+        *(pytest.param(0.004, rate, marks=pytest.mark.thorough) for rate in (20.0, 60.0)),
     ],
 )
 def test_the_teeth_are_as_long_as_the_steps_and_cost_what_a_steady_cut_does(cell, rate) -> None:
@@ -25,6 +24,7 @@ def test_the_teeth_are_as_long_as_the_steps_and_cost_what_a_steady_cut_does(cell
     assert found.swing > 0.2 * STEADY
 
 
+@pytest.mark.thorough
 def test_the_hand_feels_each_tooth_fall_from_one_tick_to_the_next() -> None:
     found, fall = felt_by_hand(0.004)
     assert found.length == pytest.approx(CRACK, rel=0.1)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from live import node_words, running
+from live import free_domain, node_words, running
 
 pytest.importorskip('rclpy')
 
@@ -18,7 +18,7 @@ from cutting_trainer.session.node_commands import MODULES, node_environment
 pytestmark = pytest.mark.live
 
 ROOT = Path(__file__).resolve().parents[1]
-DOMAIN = 89
+DOMAIN = free_domain()
 SCENE = """
 arm:
   frame_id: MTML_base

@@ -15,7 +15,7 @@ from cutting_trainer.tissue_sim.mesh.topology import CUT
 from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.thorough
 
 TOUGHNESS, RATE, EDGE = 40.0, 500.0, 0.0025
 MATERIAL = Material(30000.0, 0.4, 1000.0, 5.0, 2e-4)
@@ -74,11 +74,7 @@ REVERSED = (*ENTRY, (0.030, 0.0138, 0.0112), (0.0235, 0.0138, 0.0112), (0.037, 0
 
 
 @pytest.mark.parametrize(
-    'stops',
-    [
-        pytest.param(STRAIGHT, id='straight'),
-        pytest.param(REVERSED, id='reversed', marks=pytest.mark.thorough),
-    ],
+    'stops', [pytest.param(STRAIGHT, id='straight'), pytest.param(REVERSED, id='reversed')]
 )
 def test_the_work_of_the_blade_is_accounted_for_within_five_per_cent(stops) -> None:
     nodes, tets = irregular_box((24, 10, 8), EDGE, 3, jitter=0.1)

@@ -260,9 +260,9 @@ def random_delays() -> Iterator[float]:
     ('delays', 'waits'),
     [
         (lambda: itertools.repeat(0.0), False),
-        (lambda: itertools.repeat(0.005), False),
-        (lambda: itertools.repeat(0.05), True),
-        (lambda: itertools.repeat(0.2), True),
+        pytest.param(lambda: itertools.repeat(0.005), False, marks=pytest.mark.thorough),
+        pytest.param(lambda: itertools.repeat(0.05), True, marks=pytest.mark.thorough),
+        pytest.param(lambda: itertools.repeat(0.2), True, marks=pytest.mark.thorough),
         (random_delays, True),
     ],
     ids=['0 ms', '5 ms', '50 ms', '200 ms', 'random'],

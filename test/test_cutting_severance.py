@@ -36,8 +36,10 @@ def plate() -> Organ:
     [
         (2, 0),
         (3, 2),
-        (4, 1),
-        *(pytest.param(*case, marks=pytest.mark.thorough) for case in ((2, 3), (2, 6), (3, 3))),
+        *(
+            pytest.param(*case, marks=pytest.mark.thorough)
+            for case in ((2, 3), (2, 6), (3, 3), (4, 1))
+        ),
     ],
 )
 def test_a_circle_through_a_slab_frees_its_plug_where_the_blade_went(plate, ratio, seed):
@@ -91,6 +93,7 @@ def test_strokes_that_meet_at_their_ends_free_a_plug(plate):
     check_area(mesh, area)
 
 
+@pytest.mark.thorough
 def test_strokes_that_cross_near_their_ends_free_a_plug():
     organ = slab()
     run = measure(organ, four_lines(organ, 4, np.random.default_rng(6)))
@@ -109,7 +112,9 @@ def test_slivers_are_cut_at_their_nodes(cloud):
     assert run.error == '' and run.free and run.said == ()
 
 
-@pytest.mark.parametrize('seed', [1001, 1004, 1006])
+@pytest.mark.parametrize(
+    'seed', [1001, *(pytest.param(n, marks=pytest.mark.thorough) for n in (1004, 1006))]
+)
 def test_a_crossing_around_the_blade_may_end_at_a_node_put_on_the_cut(cloud, seed):
     """A flat element puts its node on the cut, while the blade is still in another of its edges."""
     run = measure(cloud, curved(cloud, 'spiral', np.random.default_rng(seed)))
@@ -148,7 +153,9 @@ def test_a_blade_parallel_to_the_surface_takes_no_volume(depth):
     check_mesh(mesh, volume)
 
 
-@pytest.mark.parametrize('depth', [1.0, 2.0, 4.0])
+@pytest.mark.parametrize(
+    'depth', [2.0, *(pytest.param(d, marks=pytest.mark.thorough) for d in (1.0, 4.0))]
+)
 def test_the_opened_area_is_the_swept_one(depth):
     """In the mean of some directions: a front follows the elements, now beyond, now short."""
     nodes, tetrahedra = good_block((8, 8, 6), 0.005, seed=0)

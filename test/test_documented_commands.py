@@ -112,12 +112,13 @@ SHOWN = {
 }
 """Run here, with a port that is free, until they say this; then ended by Ctrl-C."""
 SERVED_ALIKE = (
+    'view --bag BAG',
     'view --bag BAG --resimulate',
     'view --bag BAG --with tissue.material.toughness=40',
 )
 """Of these, what test_view_replay.py and test_resimulation.py claim without a process."""
-COMPUTED_ALIKE = tuple(command for command in HERE if ' --with ' in command)
-"""Of `HERE`, what test_resimulation.py claims of other changes."""
+COMPUTED_ALIKE = tuple(c for c in HERE if c.startswith(('film ', 'resimulate ')))
+"""Of `HERE`, what test_film.py and test_resimulation.py claim of shorter films and other bags."""
 SCHEDULER = Nowhere('`python -m bench.figures studies` starts them with a free port')
 DRIVES = Elsewhere(
     'test_integrate.py::test_example_that_drives_the_tool_presses_and_follows_the_mesh',

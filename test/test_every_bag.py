@@ -72,6 +72,7 @@ def test_rosbags_reads_every_bag_as_we_do(every_bag: dict[Path, Topics]) -> None
         list(several.map(check_by_rosbags, every_bag, every_bag.values()))
 
 
+@pytest.mark.thorough
 def test_mcap_core_reads_every_bag_as_we_do_by_index_and_by_stream(
     every_bag: dict[Path, Topics],
 ) -> None:

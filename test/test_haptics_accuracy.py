@@ -12,6 +12,7 @@ from cutting_trainer.session.scene_loader import load_scene
 pytestmark = pytest.mark.long
 
 
+@pytest.mark.thorough
 def test_default_keeps_its_bar_while_sliding_at_1_hz_and_holding_the_force_does_not():
     sliding = next(motion for motion in MOTIONS if motion.name == 'sliding 1 Hz')
     rows = measure(

@@ -7,6 +7,7 @@ import pytest
 import rclpy
 from bridge_world import Record, World, session
 from geometry_msgs.msg import PoseStamped
+from live import free_domain
 from rclpy.node import Node
 
 from cutting_trainer.haptic_bridge.force_kernels import INSIDE
@@ -15,7 +16,7 @@ from cutting_trainer.node_common.cdr_codec import ForceSampleCodec
 
 pytestmark = pytest.mark.live
 
-DOMAIN = 87
+DOMAIN = free_domain()
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
 device: {profile: dvrk_mtm}

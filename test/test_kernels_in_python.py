@@ -30,6 +30,7 @@ def small_session(**environment: str) -> dict[str, np.ndarray]:
     return {name: np.array(values) for name, values in json.loads(done.stdout).items()}
 
 
+@pytest.mark.thorough
 def test_kernels_in_python_come_to_what_the_compiled_ones_do_but_for_rounding() -> None:
     compiled, python = small_session(), small_session(NUMBA_DISABLE_JIT='1')
     assert compiled.keys() == python.keys()

@@ -121,7 +121,9 @@ def going_on(
             id='budget',
         ),
         pytest.param(
-            {'tissue.model': 'corotational_smoothed', 'cutting.method': 'delete'}, id='smoothed'
+            {'tissue.model': 'corotational_smoothed', 'cutting.method': 'delete'},
+            id='smoothed',
+            marks=pytest.mark.thorough,
         ),
         pytest.param(
             {'tissue.model': 'stiffening', 'tissue.material.stiffening': '6'},
@@ -129,7 +131,9 @@ def going_on(
             marks=pytest.mark.thorough,
         ),
         pytest.param(
-            {'tissue.model': 'stiffening', 'tissue.active_region.mode': 'on'}, id='law-active'
+            {'tissue.model': 'stiffening', 'tissue.active_region.mode': 'on'},
+            id='law-active',
+            marks=pytest.mark.thorough,
         ),
         pytest.param(
             VISCOUS | {'tissue.model': 'linear', 'tissue.active_region.mode': 'on'},

@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from live import node_words, running
+from live import free_domain, node_words, running
 
 from cutting_trainer.haptic_bridge.devices.omni import ForceLatch, OmniConvention
 from cutting_trainer.session.node_commands import node_environment
 
 ROOT = Path(__file__).resolve().parents[1]
-DOMAIN = 90
+DOMAIN = free_domain()
 MILLISECOND = 1_000_000
 
 

@@ -25,6 +25,7 @@ def drawn() -> list[Fault]:
     return draw(ROOT, COUNT, 3)
 
 
+@pytest.mark.thorough
 def test_a_seed_gives_one_draw_of_every_kind_from_kernels_and_nodes(drawn: list[Fault]) -> None:
     assert draw(ROOT, COUNT, 3) == drawn != draw(ROOT, COUNT, 4)
     assert [fault.kind for fault in drawn] == list(itertools.islice(itertools.cycle(KINDS), COUNT))
@@ -32,6 +33,7 @@ def test_a_seed_gives_one_draw_of_every_kind_from_kernels_and_nodes(drawn: list[
     assert len({fault.room for fault in drawn}) >= 10
 
 
+@pytest.mark.thorough
 def test_a_planted_fault_changes_its_line_alone_and_compiles(drawn: list[Fault]) -> None:
     for fault in drawn:
         source = (ROOT / fault.path).read_text()
@@ -46,6 +48,7 @@ def test_a_planted_fault_changes_its_line_alone_and_compiles(drawn: list[Fault])
             fault.plant(source[: source.index('\n')])
 
 
+@pytest.mark.thorough
 def test_tests_that_name_a_function_are_tried_first() -> None:
     fault = Fault('cutting/broad_phase.py', 1, 0, 'swept_boxes', True, 'sign', '', '')
     near = likely_tests(ROOT, fault)
@@ -95,6 +98,7 @@ class StubCopy:
         return Outcome('test/test_x.py::test_x' if fault or number else None, 1.0)
 
 
+@pytest.mark.thorough
 def test_an_interrupted_run_goes_on_with_the_fault_it_was_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drawn: list[Fault]
 ) -> None:

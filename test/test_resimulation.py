@@ -303,6 +303,7 @@ def with_changes(temporary: Path, *changes: str) -> Run:
     return run_experiment(bag, scene, recomputation(scene))
 
 
+@pytest.mark.thorough
 def test_the_same_hand_on_the_same_tissue_gives_the_same_and_on_a_tougher_one_more_force(
     tmp_path: Path,
 ) -> None:

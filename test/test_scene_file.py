@@ -1,5 +1,6 @@
 """A bad scene gives one sentence with file, line, key, value and remedy; a good one is read."""
 
+import functools
 import json
 import re
 from pathlib import Path
@@ -213,10 +214,16 @@ def test_a_shipped_scene_is_complete_and_valid(scene):
     assert 10 < fixed.sum() <= len(fixed) / 2
 
 
+@functools.cache
+def corners(scene: Path) -> tuple[np.ndarray, ...]:
+    """Corners of all faces of the scene's tissue [m], each shape (n, 3)."""
+    nodes, tetrahedra, *_ = load_tissue(read_section(scene, 'tissue', TissueSettings))
+    return tuple(np.moveaxis(nodes[tetrahedra[:, FACES].reshape(-1, 3)], 1, 0))
+
+
 def height(scene: Path, x: float, y: float) -> float:
     """Largest z [m] of the scene's tissue above (x, y); minus infinity beside it."""
-    nodes, tetrahedra, *_ = load_tissue(read_section(scene, 'tissue', TissueSettings))
-    a, b, c = np.moveaxis(nodes[tetrahedra[:, FACES].reshape(-1, 3)], 1, 0)
+    a, b, c = corners(scene)
     double = _cross(b - a, c - a)
     upright = np.abs(double) > 1e-12
     point = np.array([x, y, 0])

@@ -103,6 +103,7 @@ def test_failures_are_rows_with_their_reasons_and_each_bag_is_computed_as_record
     assert 'toughness=20' in page and 'no stable step' in page
 
 
+@pytest.mark.thorough
 def test_two_workers_of_which_one_is_killed_make_the_same_table_to_the_bit(
     folder: Path, one_worker: Path
 ) -> None:
@@ -133,6 +134,7 @@ def workers_of(process: int) -> list[int]:
     return found
 
 
+@pytest.mark.thorough
 def test_killed_study_goes_on_and_has_each_row_once(folder: Path, one_worker: Path) -> None:
     output, file = folder / 'killed', folder / 'study.yaml'
     command = [sys.executable, '-m', 'cutting_trainer.cli', 'study', str(file), '-o', str(output)]
@@ -153,6 +155,20 @@ def test_killed_study_goes_on_and_has_each_row_once(folder: Path, one_worker: Pa
     run_study(StudyOptions(file, output, workers=1))
     after = (output / JOURNAL_FILE).read_bytes()
     assert after.startswith(before) and after.count(b'\n') == ROWS
+    assert (output / TABLE_FILE).read_bytes() == (one_worker / TABLE_FILE).read_bytes()
+
+
+def test_study_goes_on_after_the_last_whole_row_of_its_journal(
+    folder: Path, one_worker: Path
+) -> None:
+    output = folder / 'cut off'
+    output.mkdir()
+    whole = (one_worker / JOURNAL_FILE).read_bytes().splitlines(keepends=True)
+    kept = b''.join(whole[:-1])
+    (output / JOURNAL_FILE).write_bytes(kept + whole[-1][:20])
+    run_study(StudyOptions(folder / 'study.yaml', output, workers=1))
+    after = (output / JOURNAL_FILE).read_bytes()
+    assert after.startswith(kept) and after.count(b'\n') == ROWS
     assert (output / TABLE_FILE).read_bytes() == (one_worker / TABLE_FILE).read_bytes()
 
 

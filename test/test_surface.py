@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from surfaces import distance, grid
+from surfaces import distances, grid
 
 from cutting_trainer.haptic_bridge.proxy import half_spaces
 from cutting_trainer.haptic_bridge.proxy.neighbourhood import CAPACITY, NEAR, gather
@@ -30,7 +30,7 @@ def test_nearest_triangles_are_those_of_brute_force_at_any_blend(seed, blend, mo
     point = rng.uniform(-0.06, 0.06, 3)
     gather(surface.geometry, blend, point, 0.03, most, near)
     blended = positions + blend * (moved - positions)
-    every = sorted(distance(blended, t[None], point) for t in triangles)
+    every = sorted(distances(blended, triangles, point))
     expected = [d for d in every if d < 0.03][:most]
     w = near[0]
     assert w['count'] == len(expected)

@@ -129,6 +129,7 @@ def test_more_contacts_than_tools_are_refused() -> None:
         block(tools=1).frame(None, None)
 
 
+@pytest.mark.thorough
 def test_far_nodes_move_with_both_tools_where_only_the_near_ones_are_awake() -> None:
     """Nodes sleep away from the tools: with two, both have awake nodes around them."""
     settings = ActiveSettings('on', tolerance=1e-4)

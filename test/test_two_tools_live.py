@@ -189,7 +189,9 @@ def is_of_grasper(entry: Path, scene: Path, node: str) -> bool:
     return module in words and '__ns:=/grasper' in words and any(str(scene) in w for w in words)
 
 
-@pytest.mark.parametrize('node', NAMES)
+@pytest.mark.parametrize(
+    'node', ['emulated_arm', pytest.param('haptic_bridge', marks=pytest.mark.thorough)]
+)
 def test_when_one_arm_or_bridge_dies_the_other_tool_goes_on(
     session: LiveSession, node: str
 ) -> None:

@@ -45,13 +45,15 @@ def test_the_cube_has_the_stress_of_the_law_in_tension_and_shear() -> None:
     assert cube.shear(1.0) == pytest.approx(mu, rel=1e-3)
 
 
-@pytest.mark.parametrize('cell', [0.0053, 0.0044])
+@pytest.mark.parametrize('cell', [0.0053, pytest.param(0.0044, marks=pytest.mark.thorough)])
 def test_the_steady_force_of_a_blade_is_toughness_times_its_depth(cell: float) -> None:
     found = drawn('stiffening', 187.0, E0, cell)
     assert found.force[0] == pytest.approx(187.0 * found.depth, rel=0.07)
 
 
-@pytest.mark.parametrize(('toughness', 'ratio'), [(76.0, 1.5), (120.0, 0.5)])
+@pytest.mark.parametrize(
+    ('toughness', 'ratio'), [pytest.param(76.0, 1.5, marks=pytest.mark.thorough), (120.0, 0.5)]
+)
 def test_a_blade_that_slices_feels_the_force_of_atkins(toughness: float, ratio: float) -> None:
     found = drawn('stiffening', toughness, FIRM, 0.0044, ratio)
     across = toughness * found.depth / (1 + ratio**2)

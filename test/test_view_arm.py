@@ -93,6 +93,7 @@ def command(scene: Path, tmp_path: Path) -> tuple[list[str], Path]:
 
 
 @pytest.mark.live
+@pytest.mark.thorough
 def test_a_driver_that_runs_gets_force_and_the_bag_computes_again(
     command: tuple[list[str], Path], scene: Path, tmp_path: Path
 ) -> None:

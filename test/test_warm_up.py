@@ -104,7 +104,7 @@ def said(program: str, *arguments: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.parametrize('scene', ['liver', 'block'])
+@pytest.mark.parametrize('scene', [pytest.param('liver', marks=pytest.mark.thorough), 'block'])
 def test_setup_has_compiled_and_nodes_have_loaded_all_that_a_session_calls(scene: str) -> None:
     later, missing = said(IN_SESSION, scene)
     kernels, found = later.split(' loaded later: ')
