@@ -82,8 +82,12 @@ def test_separation_alone_makes_no_elements_and_a_jagged_cut():
 def test_deletion_loses_mass_and_leaves_a_gap():
     mesh = block(0)
     volume = mesh.volumes().sum()
-    lost = sum(r.report.removed_volume for r in draw(method_named('delete'), mesh, path()))
+    results = draw(method_named('delete'), mesh, path())
+    lost = sum(result.report.removed_volume for result in results)
     assert lost > 0.05 * volume
+    # It reports no area: else a stroke that was applied would seem to have cut nothing.
+    assert total_area(results) == 0.0
+    assert f'removed {1e6 * lost:.2f} cm^3' in results[-1].report.warnings[0]
     assert mesh.volumes().sum() == pytest.approx(volume - lost, rel=1e-12)
     assert distances(mesh).max() > 0.5
 
