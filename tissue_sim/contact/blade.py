@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.anchor import Anchor, anchor_of
-from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
-from cutting_trainer.tissue_sim.contact.edge import (
+from cutting_trainer.tissue_sim.contact.blade_law import (
     WHOLE,
     Pull,
     carry_edge,
@@ -22,6 +21,7 @@ from cutting_trainer.tissue_sim.contact.edge import (
     gather_loads,
     no_pull,
 )
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
 from cutting_trainer.tissue_sim.contact.facing import BLADE_HEIGHT, Law
 from cutting_trainer.tissue_sim.contact.fracture import BLADE_THICKNESS, Strips
 from cutting_trainer.tissue_sim.contact.immersion import POINTS, SHARES, Edge, Tissue
