@@ -22,7 +22,6 @@ from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedC
 
 pytestmark = pytest.mark.live
 
-DOMAIN = free_domain()
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
 device: {profile: dvrk_mtm}
@@ -287,7 +286,7 @@ def record(tmp_path_factory):
     for _ in range(3):
         scene = tmp_path_factory.mktemp('faults') / 'flat.yaml'
         scene.write_text(SCENE)
-        recorded = session(scene, DOMAIN, play, FaultyWorld)
+        recorded = session(scene, free_domain(), play, FaultyWorld)
         if recorded.marks['longest gap'] < 0.1:
             return recorded
     return pytest.fail(f'this machine held the device up for {recorded.longest_pose_gap:.3f} s')

@@ -23,7 +23,6 @@ from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedC
 
 pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
-DOMAIN = free_domain()
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
 device: {profile: dvrk_mtm, hold_button: true}
@@ -170,7 +169,7 @@ def play(world: HostileWorld, record: Record) -> None:
 def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
     scene = tmp_path_factory.mktemp('fuzz') / 'flat.yaml'
     scene.write_text(SCENE)
-    return session(scene, DOMAIN, play, HostileWorld)
+    return session(scene, free_domain(), play, HostileWorld)
 
 
 def test_every_force_is_finite_and_within_the_limits_of_the_device(record: Record) -> None:

@@ -29,7 +29,7 @@ from cutting_trainer.recordings.resimulate_command import pose_check, recomputat
 from cutting_trainer.recordings.what_if import recorded_run, run_experiment
 from cutting_trainer.session.scene_loader import load_scene
 
-pytestmark = [pytest.mark.live, pytest.mark.thorough]
+pytestmark = pytest.mark.live
 
 SECONDS = 9.0
 ASIDE = (0.006, 0.004)

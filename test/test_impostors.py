@@ -16,7 +16,6 @@ from cutting_trainer.node_common.cdr_codec import ForceSampleCodec
 
 pytestmark = pytest.mark.live
 
-DOMAIN = free_domain()
 SCENE = """
 tool: {radius: 0.004, coupling_stiffness: 200}
 device: {profile: dvrk_mtm}
@@ -63,7 +62,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
     scene = tmp_path_factory.mktemp('impostors') / 'flat.yaml'
     scene.write_text(SCENE)
     assert not rclpy.ok()
-    return session(scene, DOMAIN, play)
+    return session(scene, free_domain(), play)
 
 
 @pytest.mark.parametrize('name', ['slow', 'silent'])

@@ -52,7 +52,7 @@ from cutting_trainer.node_common.cdr_codec import ForceSampleCodec, PoseStampedC
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.node_commands import node_environment
 
-pytestmark = [pytest.mark.live, pytest.mark.long]
+pytestmark = pytest.mark.live
 
 SECONDS = 7.0
 TISSUE_DEADLINE, BRIDGE_DEADLINE = 0.150, 0.030

@@ -47,7 +47,7 @@ from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
-pytestmark = [pytest.mark.live, pytest.mark.long]
+pytestmark = pytest.mark.live
 
 DEVICE = DeviceSettings().load_profile()
 SECONDS = 10.5
