@@ -16,8 +16,7 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.parameter import Parameter
 
-from cutting_trainer.haptic_bridge.device_button import DeviceButton
-from cutting_trainer.haptic_bridge.device_jaw import DeviceJaw
+from cutting_trainer.haptic_bridge.device_inputs import DeviceInputs
 from cutting_trainer.haptic_bridge.devices.convention import DeviceConvention
 from cutting_trainer.haptic_bridge.devices.probe_graph import Wiring
 from cutting_trainer.haptic_bridge.e_stop_topic import EStop, Listener
@@ -59,7 +58,6 @@ from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
-from cutting_trainer.tissue_sim.streaming.reset_client import ResetClient
 
 MESH_POLL_PERIOD_S = 0.003
 """[s] between two polls for a mesh of the simulation, while one is due."""
@@ -73,8 +71,6 @@ CLOCK_STEP_NS = 1_000_000
 """[ns] by which the system clock may differ from the stamps before they follow it."""
 
 
-BUTTON, CLUTCH = 'button', 'clutch'
-"""Topics of buttons below `arm`."""
 SCALES = ('force_scale', 'motion_scale')
 SETTABLE = (*SCALES, 'tool_mode')
 """Parameters that may change while the node runs."""
@@ -168,18 +164,7 @@ class HapticBridge(ManagedNode):
         text = f'what the tool is: {" or ".join(MODES)}; used once no blade is in the tissue'
         mode = parameter(self, 'tool_mode', tool.mode, text, settable=True)
         self._path.next_mode = mode_of(mode)
-        self._mode_button = None
-        if device.mode_button is not None:
-            self._mode_button = DeviceButton(self, BUTTON, device.mode_button, self._change_mode)
-        self._reset_button = None
-        if device.reset_button is not None:
-            self._resetter = ResetClient(self, self.get_logger().warning)
-            self._reset_button = DeviceButton(self, BUTTON, device.reset_button, self._reset_tissue)
-        self._jaw = None
-        if device.jaw_closed is not None:
-            self._jaw = DeviceJaw(self, device.jaw_closed, self._change_jaw)
-        clutch = (CLUTCH, 0) if device.clutch_button is None else (BUTTON, device.clutch_button)
-        self._clutch = DeviceButton(self, *clutch, self._change_clutch)
+        self._inputs = DeviceInputs(self, device, self._path)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
         self._epoch = time.time_ns() - time.monotonic_ns()
@@ -271,27 +256,6 @@ class HapticBridge(ManagedNode):
             if given.name == 'tool_mode':
                 self._path.next_mode = mode_of(given.value)
 
-    def _change_mode(self, pressed: bool) -> None:
-        """Make a palpator of the scalpel, or close the jaws of a grasper, and back."""
-        if pressed:
-            self._set_mode(self._path.next_mode.other)
-
-    def _reset_tissue(self, pressed: bool) -> None:
-        """Ask for the whole tissue; force and E-STOP stay as they are."""
-        if pressed:
-            self._resetter.ask()
-
-    def _change_jaw(self, closed: bool) -> None:
-        """Make of the tool what it is with its jaws closed, or open."""
-        self._set_mode(self._path.next_mode.with_jaws(closed=closed))
-
-    def _set_mode(self, mode: ToolMode) -> None:
-        self.set_parameters([Parameter('tool_mode', value=mode.name.lower())])
-
-    def _change_clutch(self, pressed: bool) -> None:
-        """Take the hand off the tool while the button is pressed."""
-        self._path.coupling.change(clutched=pressed)
-
     def _cause(self) -> str:
         now = time.monotonic_ns()
         streams = self._watch.cause(now) or self._follower.cause(now)
@@ -352,8 +316,7 @@ class HapticBridge(ManagedNode):
             self._machine.fault(stranger)
         if self._button is not None:
             self._button.enforce()
-        if self._jaw is not None:
-            self._jaw.poll()
+        self._inputs.poll()
         self._auto_enable.look(self._can_begin)
         now = time.monotonic()
         if self._machine.state is CrtkState.ENABLED and now >= self._wiring_due:

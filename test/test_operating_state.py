@@ -361,7 +361,7 @@ def test_the_mode_of_the_tool_is_a_parameter_and_a_button_changes_it(bridge: Hap
     assert not refused.successful and 'scalpel or palpator or open_grasper' in refused.reason
     bridge.set_parameters([Parameter('tool_mode', value='palpator')])
     assert bridge._path.next_mode == ToolMode.PALPATOR
-    button = DeviceButton(bridge, 'button', 1, bridge._change_mode)
+    button = DeviceButton(bridge, 'button', 1, bridge._inputs.change_mode)
     for pressed in ([0, 0], [0, 1], [0, 1], [0, 0]):
         button._event(Joy(buttons=pressed))
     assert bridge._path.next_mode == ToolMode.SCALPEL
@@ -383,7 +383,7 @@ def test_the_scale_of_motion_is_a_parameter_and_a_button_is_the_clutch(bridge: H
     assert (before.scale, coupling.indexing.scale) == (1.0, 0.5)
     assert coupling.indexing.after_ns == 5
     for pressed in (1, 0):
-        bridge._clutch._event(Joy(buttons=[pressed]))
+        bridge._inputs.clutch._event(Joy(buttons=[pressed]))
         coupling.carry_out(state, 6)
         assert coupling.indexing.clutched == pressed
     assert [i.clutched for i in coupling.unsent] == [False, True, False]
