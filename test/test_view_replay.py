@@ -171,7 +171,10 @@ def test_two_sessions_stand_side_by_side_and_their_hands_begin_together(
         reader = OpenPage(url(page))
         page.seek(0.5 * first.end)
         reader.wait(
-            lambda: (page.update(time.monotonic()), 'beside' in reader.values)[1], 'both tissues'
+            lambda: (page.update(time.monotonic()), {'beside', 'moment'} <= reader.values.keys())[
+                1
+            ],
+            'both tissues and the tools',
         )
         moment = reader.values['moment']
         (further,) = moment['further']
