@@ -1,4 +1,7 @@
-"""Score of an attempt, with the reason for each deduction."""
+"""Score of an attempt, with the reason for each deduction.
+
+The measures themselves are computed in `metrics.py`.
+"""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""A button of the device that changes the tool, or takes the hand off it."""
+"""Follows one button of the device; `device_inputs.py` gives each button its action."""
 
 from collections.abc import Callable
 

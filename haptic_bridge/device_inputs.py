@@ -1,4 +1,7 @@
-"""Buttons and jaws of the device, and their actions: mode of the tool, clutch, reset."""
+"""Buttons and jaws of the device, and their actions: mode of the tool, clutch, reset.
+
+E-STOP is in `e_stop_topic.py`, `hold_button` in `node_common/crtk.py`.
+"""
 
 from functools import partial
 

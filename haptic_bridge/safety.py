@@ -6,6 +6,8 @@ every commanded force: its norm is at most max_force, and it differs from the la
 max_slew times the time between, also on its way to zero. The second has one exception: where the
 input cannot be trusted at all (a NaN, a device that jumps or is silent, FAULT), the force is zero
 at once.
+
+The latch of E-STOP is in `node_common/operating_state.py`.
 """
 
 import numpy as np

@@ -1,4 +1,7 @@
-"""Governor of the frame rate: what the tissue concedes while frames come late."""
+"""Governor of the frame rate: what the tissue concedes while frames come late.
+
+The shares of nodes are `SHARES` in `motion/far_field.py`.
+"""
 
 from collections import deque
 

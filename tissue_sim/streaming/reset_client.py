@@ -1,4 +1,4 @@
-"""Client of the service `tissue/reset`: asks for the whole tissue again."""
+"""Client of the service `tissue/reset`, which `tissue_sim/node.py` serves."""
 
 from collections.abc import Callable
 from typing import Any
