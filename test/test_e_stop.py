@@ -37,7 +37,7 @@ device: {profile: dvrk_mtm, e_stop_button: 1}
 haptics: {soft_start: 0.0, device_timeout: 0.5, stale_after: 1.0}
 """
 """A test that gets no turn is no fault here."""
-PRESSES = 40
+PRESSES = 100
 """How often E-STOP is pressed while words are sent."""
 
 

@@ -19,7 +19,7 @@ from cutting_trainer.session.node_commands import PROFILES, RANGE, discovery, no
 pytestmark = pytest.mark.long
 
 DDS = '{http://www.eprosima.com}'
-FREEZES, SENT = 20, 20
+FREEZES, SENT = 40, 20
 """A process that is stopped, or killed, at a random moment may hold a lock. What another sends
 meanwhile."""
 TALK = """

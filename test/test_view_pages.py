@@ -327,7 +327,7 @@ def test_values_are_put_by_any_thread_while_pages_come_and_go(stand_in: StandIn)
     threads = [threading.Thread(target=put, args=(number,)) for number in range(3)]
     for thread in threads:
         thread.start()
-    for _ in range(10):
+    for _ in range(20):
         page = OpenPage(stand_in.url)
         page.wait(lambda page=page: len(page.values) > 100, 'the values')
         page.close()

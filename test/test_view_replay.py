@@ -170,12 +170,12 @@ def test_two_sessions_stand_side_by_side_and_their_hands_begin_together(
     try:
         reader = OpenPage(url(page))
         page.seek(0.5 * first.end)
-        reader.wait(
-            lambda: (page.update(time.monotonic()), {'beside', 'moment'} <= reader.values.keys())[
-                1
-            ],
-            'both tissues and the tools',
-        )
+
+        def is_drawn() -> bool:
+            page.update(time.monotonic())
+            return {'beside', 'moment'} <= reader.values.keys()
+
+        reader.wait(is_drawn, 'both tissues and the tools')
         moment = reader.values['moment']
         (further,) = moment['further']
         apart = np.subtract(further['tip'], moment['tip'])
