@@ -69,10 +69,12 @@ def press_reset(domain: int) -> None:
     node = Node('device', context=context)
     presses = node.create_publisher(Joy, 'arm/button', qos.EVENTS)
     samples, seen = polled(node, ForceSample, FORCE, qos.NEWEST_BEST_EFFORT), 0
+    pressed = Joy(buttons=[0, 1])
 
     def is_reset() -> bool:
         nonlocal seen
-        presses.publish(Joy(buttons=[0, 1]))
+        if seen:  # else the tissue could be reset before its frames are heard here
+            presses.publish(pressed)
         sample = take(samples)
         before, seen = seen, sample.step if sample else seen
         return seen < before

@@ -49,6 +49,9 @@ OTHER = (0.012, 0.008)
 TOUCHED, LIFTED = 0.0110, 0.0220
 """Heights of the tips [m]; the surface is at 10 mm and the radius 4 mm."""
 NAMES = ('emulated_arm', 'haptic_bridge')
+RATE = 500.0
+"""[Hz] of arms and bridges: four loops of 1 kHz and their recorder take more than two slow cores.
+The rate of two arms is a figure, not a claim of these tests (`bench/figures/arms_two_tools.py`)."""
 
 
 def two_arms(folder: Path) -> Path:
@@ -71,11 +74,12 @@ def two_arms(folder: Path) -> Path:
         phase('retract', (*OTHER, 0.0300, 1.0), share=1.6),
     ]
     start = {'position': [*OTHER, 0.030]}
+    scene['haptics']['rate'] = scene['arm']['rate'] = RATE
     scene['tools'] = {
         'grasper': {
             'tool': {'mode': 'open_grasper'},
             'device': {'mode_button': 0},
-            'arm': {'script': {'start': start, 'seconds': SECONDS, 'phases': grasps}},
+            'arm': {'rate': RATE, 'script': {'start': start, 'seconds': SECONDS, 'phases': grasps}},
         }
     }
     with path.open('w') as file:
