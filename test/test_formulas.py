@@ -18,7 +18,7 @@ from cutting_trainer.haptic_bridge.force_kernels import _rotate
 from cutting_trainer.haptic_bridge.proxy.kernels import _SAME_DIRECTION_COS, STATE, _touched
 from cutting_trainer.haptic_bridge.proxy.surface import LEAF_SIZE, _fitted_boxes
 from cutting_trainer.tissue_sim.elasticity import stiffening_simd
-from cutting_trainer.tissue_sim.elasticity.adaptive_law import _element_norms, add_tangent_rows
+from cutting_trainer.tissue_sim.elasticity.adaptive_law import add_tangent_traces, linear_traces
 from cutting_trainer.tissue_sim.elasticity.corotational import KEPT
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
@@ -94,16 +94,32 @@ def test_the_energy_of_a_stress_alone_is_legendres_transform_of_the_laws(exponen
     assert _conjugate(stress * stress, law) == pytest.approx(stress * stress / (4.0 * mu))
 
 
-def test_rows_of_an_element_have_the_norms_of_its_shape_functions() -> None:
-    rng = np.random.default_rng(6)
-    g, nodes, lane = rng.standard_normal((4, 3)), np.array([7, 2, 5, 0]), 3
-    corners = np.zeros(4 * LANES, np.int64)
-    corners[lane::LANES] = 3 * nodes
-    rows = np.ones(8)
-    _element_norms(SimpleNamespace(corners=corners), lane, g.ravel(), 0.25, rows)
-    norms, expected = np.linalg.norm(g, axis=1), np.ones(8)
-    expected[nodes] += 0.25 * norms * norms.sum()
-    np.testing.assert_allclose(rows, expected, rtol=1e-14)
+def test_traces_of_the_tangent_are_those_of_differences_of_forces() -> None:
+    """Of its 3x3 blocks on the diagonal: stretched, compressed, sheared, and without strain."""
+    mesh = TetMesh(*irregular_box((3, 2, 2), 0.01, 5))
+    material = Material(3000.0, 0.4, 1000.0, stiffening=6.0)
+    model = ElasticModel(mesh, material, 'stiffening', tolerance=0.0)
+    flat = (mesh.rest @ GRADIENT.T).ravel()
+    flat += np.random.default_rng(3).uniform(-5e-4, 5e-4, len(flat))
+    operands, n, step = model.operands(), mesh.node_count, 1e-8
+    parts = operands.law, operands.domains, operands.elements
+    linear, excess = np.zeros(n), np.zeros(n)
+    linear_traces(*parts, operands.chunks, linear)
+    np.testing.assert_allclose(linear, np.trace(blocks(model.dense()), axis1=1, axis2=2), rtol=1e-9)
+    add_tangent_traces(*parts, operands.spans, operands.chunks, flat, excess, np.zeros(6))
+    tangent = np.empty((3 * n, 3 * n))
+    for i, way in enumerate(step * np.eye(3 * n)):
+        ahead, behind = ((flat + s * way).reshape(-1, 3) for s in (1, -1))
+        tangent[i] = (model.force(ahead) - model.force(behind)).ravel() / (2 * step)
+    expected = np.trace(blocks(tangent), axis1=1, axis2=2)
+    np.testing.assert_allclose(linear + excess, expected, rtol=1e-5)
+    assert excess.max() > linear.max()
+
+
+def blocks(stiffness: np.ndarray) -> np.ndarray:
+    """3x3 blocks on the diagonal, shape (n, 3, 3)."""
+    n = len(stiffness) // 3
+    return stiffness.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
 
 def test_every_domain_of_a_homogeneous_strain_has_it(tissue: ElasticModel) -> None:
@@ -113,17 +129,17 @@ def test_every_domain_of_a_homogeneous_strain_has_it(tissue: ElasticModel) -> No
     squares = np.zeros(count)
     _strain_domains(operands.domains, u, squares)
     np.testing.assert_allclose(squares, (GRADIENT**2).sum(), rtol=1e-9)
-    rows, strain = np.zeros(tissue.mesh.node_count), np.zeros(6)
+    traces, strain = np.zeros(tissue.mesh.node_count), np.zeros(6)
     parts = operands.law, operands.domains, operands.elements, operands.spans, operands.chunks
-    add_tangent_rows(*parts, u, rows, strain)
+    add_tangent_traces(*parts, u, traces, strain)
     stretches = np.linalg.svd(np.eye(3) + GRADIENT)[1]
     assert strain[0] == count
     ratio = np.prod(stretches)
     np.testing.assert_allclose(strain[2:4], [min(ratio, 1.0), max(ratio, 1.0)], rtol=1e-9)
     np.testing.assert_allclose(strain[4:], [stretches.min(), stretches.max()], rtol=1e-6)
-    assert (rows > 0).all()
+    assert (traces > 0).all()
     for part in np.eye(9).reshape(9, 3, 3):
-        add_tangent_rows(*parts, (tissue.mesh.rest @ (0.2 * part).T).ravel(), rows, strain)
+        add_tangent_traces(*parts, (tissue.mesh.rest @ (0.2 * part).T).ravel(), traces, strain)
         assert strain[0] == count, 'a strain counts whichever way it goes'
 
 

@@ -5,11 +5,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from meshes import box, irregular_box
+from strokes import method_named, straight
 
+from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.topology import CUT
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.stability import ALL_ITERATIONS
 
 pytestmark = pytest.mark.long
 
@@ -40,16 +44,8 @@ def shape(nodes: np.ndarray, kind: str) -> np.ndarray:
     return u
 
 
-@pytest.mark.parametrize('kind', ['pulled', 'pressed', 'twisted'])
-@pytest.mark.parametrize(('nu', 'stiffening'), [(0.45, 6.0), (0.3, 12.0)])
-def test_no_tangent_is_faster_than_the_step_allows(kind: str, nu: float, stiffening: float) -> None:
-    dynamics = tissue(nu, stiffening)
-    flat = shape(dynamics.mesh.rest, kind).ravel()
-    stiffened = dynamics._stiffened
-    assert stiffened is not None
-    whole = dynamics.model.operands()
-    stiffened.begin(flat, dynamics._frequency.omega, dynamics.inverse_mass, whole)
-    inverse = stiffened.adapt(flat, np.zeros_like(flat), dynamics.inverse_mass, whole)
+def highest_frequency(dynamics: Dynamics, flat: np.ndarray, inverse: np.ndarray) -> float:
+    """Of the tangent, by differences of the force [rad/s]."""
     n, step = len(flat), 1e-9
     tangent = np.empty((n, n))
     for i in range(n):
@@ -64,11 +60,51 @@ def test_no_tangent_is_faster_than_the_step_allows(kind: str, nu: float, stiffen
     free = inverse > 0
     root = np.sqrt(inverse[free])
     scaled = root[:, None] * ((tangent + tangent.T) / 2)[np.ix_(free, free)] * root
-    highest = np.sqrt(np.linalg.eigvalsh(scaled)[-1])
-    assert highest < stiffened.omega <= 2.0 * dynamics._uncut * (1 + 1e-9)
-    bare = np.sqrt(dynamics.inverse_mass[free])
-    unscaled = bare[:, None] * ((tangent + tangent.T) / 2)[np.ix_(free, free)] * bare
-    assert np.sqrt(np.linalg.eigvalsh(unscaled)[-1]) > 1.2 * dynamics._uncut
+    return float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
+
+
+def adapted(dynamics: Dynamics, flat: np.ndarray) -> tuple[float, np.ndarray]:
+    """Frequency of the step [rad/s], and inverse masses, of a displacement."""
+    stiffened, whole = dynamics._stiffened, dynamics.model.operands()
+    assert stiffened is not None
+    stiffened.begin(flat, dynamics._frequency.omega, dynamics.inverse_mass, whole)
+    inverse = stiffened.adapt(flat, np.zeros_like(flat), dynamics.inverse_mass, whole)
+    return stiffened.omega, inverse
+
+
+@pytest.mark.parametrize('kind', ['pulled', 'pressed', 'twisted'])
+@pytest.mark.parametrize(('nu', 'stiffening'), [(0.45, 6.0), (0.3, 12.0)])
+def test_no_tangent_is_faster_than_the_step_allows(kind: str, nu: float, stiffening: float) -> None:
+    dynamics = tissue(nu, stiffening)
+    flat = shape(dynamics.mesh.rest, kind).ravel()
+    omega, inverse = adapted(dynamics, flat)
+    assert highest_frequency(dynamics, flat, inverse) < omega <= 2 * dynamics._uncut * (1 + 1e-9)
+    assert highest_frequency(dynamics, flat, dynamics.inverse_mass) > 1.2 * dynamics._uncut
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_no_tangent_of_small_elements_beside_a_cut_is_faster_either(seed: int) -> None:
+    """They have few neighbours, and stiffen one by one: sums of rows say little of them."""
+    dynamics = tissue(growth=1.1)
+    rng, method = np.random.default_rng(seed), method_named()
+    ends = np.array([[-0.002, 0.009, 0.011], [0.027, 0.012, 0.012]])
+    way = straight(*(ends + rng.uniform(-0.003, 0.003, (2, 3))), (0.0, 0.001, 0.02), 8)
+    for before, after in pairwise(way):
+        sweep = Sweep(before[0], before[1], after[0], after[1])
+        dynamics.apply_cut(method.advance(dynamics.mesh, dynamics.mesh.rest, sweep).delta)
+    dynamics._frequency.refine(ALL_ITERATIONS)
+    rest, cut = (
+        dynamics.mesh.rest,
+        np.unique(dynamics.mesh.triangles[dynamics.mesh.triangle_kind == CUT]),
+    )
+    worst = 0.0
+    for _ in range(6):
+        away = rest - rest[rng.choice(cut)]
+        near = np.exp(-np.square(away).sum(axis=1) / 0.003**2)
+        flat = (0.4 * near[:, None] * (away @ rng.normal(size=(3, 3)))).ravel()
+        omega, inverse = adapted(dynamics, flat)
+        worst = max(worst, highest_frequency(dynamics, flat, inverse) / omega)
+    assert worst < 1.0
 
 
 def test_frequency_growth_limits_the_substeps_of_a_strained_tissue_too() -> None:

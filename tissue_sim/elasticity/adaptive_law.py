@@ -8,7 +8,6 @@ Domains are tested at every evaluation, elements every `_EVERY` evaluations: tho
 tolerance are candidates until the next search.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -29,13 +28,12 @@ from cutting_trainer.tissue_sim.elasticity.stiffening_simd import (
     GROUP,
     MAX_STRETCH,
     MIN_STRETCH,
-    MODULUS,
     RATIO,
     SLOTS_OF_LAW,
     STRESS,
     VOLUME,
     add_group_forces,
-    add_group_rows,
+    add_group_traces,
     groups_beyond,
     law_in_lanes,
     tangents_in_lanes,
@@ -262,62 +260,46 @@ def add_law_bounds(law, domains, elements, spans, chunks, x, f):
 
 
 @inner(error_model='numpy')
-def _row_norms(domains, i, share, rows):
-    """Add share |G_ij| sum_k |G_ik| to the rows of a domain's nodes."""
-    first, used = domains.start[i], domains.used[i]
-    total = 0.0
-    for k in range(first, first + used):
-        v = domains.vectors[3 * k : 3 * k + 3]
-        total += math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    for k in range(first, first + used):
-        v = domains.vectors[3 * k : 3 * k + 3]
-        size = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-        rows[domains.columns[k] // 3] += share * total * size
-
-
-@inner(error_model='numpy')
-def _element_norms(elements, tet, g, share, rows):
-    corner = 4 * (tet // LANES) * LANES + tet % LANES
-    total = 0.0
-    for a in range(4):
-        total += math.sqrt(g[3 * a] ** 2 + g[3 * a + 1] ** 2 + g[3 * a + 2] ** 2)
-    for a in range(4):
-        size = math.sqrt(g[3 * a] ** 2 + g[3 * a + 1] ** 2 + g[3 * a + 2] ** 2)
-        rows[elements.corners[corner + a * LANES] // 3] += share * total * size
+def _add_trace(domains, i, xx, xy, xz, yy, yz, zz, traces):
+    """Add V G^T B G of a domain to the traces of its nodes, B as in `tangents_in_lanes`."""
+    volume = domains.volume[i]
+    for k in range(domains.start[i], domains.start[i] + domains.used[i]):
+        x, y, z = domains.vectors[3 * k], domains.vectors[3 * k + 1], domains.vectors[3 * k + 2]
+        off = xy * x * y + xz * x * z + yz * y * z
+        square = xx * x * x + yy * y * y + zz * z * z
+        traces[domains.columns[k] // 3] += volume * (square + 2.0 * off)
 
 
 @kernel(error_model='numpy')
-def linear_rows(law, domains, elements, chunks, rows):
-    """Compute bounds of the row sums of the linear stiffness, by norms of 3x3 blocks.
+def linear_traces(law, domains, elements, chunks, traces):
+    """Compute the traces of the 3x3 blocks on the diagonal of the linear stiffness.
 
     Args:
         law, domains, elements, chunks: see `add_law_forces`.
-        rows: output [N/m], shape (n,).
+        traces: output [N/m], shape (n,).
     """
-    rows[:] = 0.0
-    g, h, u = np.empty(12), np.empty(9), np.zeros(3 * rows.shape[0])
-    mu = law.elements[0] + law.elements[1]
-    modulus = 2.0 * (law.domains[0] + law.domains[1]) + law.domains[2]
+    traces[:] = 0.0
+    g, h, u = np.empty(12), np.empty(9), np.zeros(3 * traces.shape[0])
+    both = 4.0 * (law.domains[0] + law.domains[1]) + law.domains[2]
     for i in range(domains.used.shape[0]):
-        _row_norms(domains, i, domains.volume[i] * modulus, rows)
+        _add_trace(domains, i, both, 0.0, 0.0, both, 0.0, both, traces)
     for k in chunks:
         for tet in range(k * LANES, (k + 1) * LANES):
-            stiffness = elements.data[k * KEPT * LANES + 13 * LANES + tet % LANES]
-            if stiffness > 0.0:
-                _element_gradient(elements, tet, u, g, h)
-                _element_norms(elements, tet, g, stiffness, rows)
-    return mu
+            _, stiffness = _element_gradient(elements, tet, u, g, h)
+            corner = 4 * k * LANES + tet % LANES
+            for a in range(4):
+                square = g[3 * a] ** 2 + g[3 * a + 1] ** 2 + g[3 * a + 2] ** 2
+                traces[elements.corners[corner + a * LANES] // 3] += 2.0 * stiffness * square
 
 
 @inner(error_model='numpy')
-def _flush_rows(law, domains, waiting, chunk, rows, strain):
+def _flush_traces(law, domains, waiting, chunk, traces, strain):
     """Add what the tangents of the domains in the lanes have more, and note their strain."""
-    L, modulus = LANES, 2.0 * (law.domains[0] + law.domains[1]) + law.domains[2]
+    L = LANES
     tangents_in_lanes(chunk, law.domains)
     for lane in range(waiting.shape[0]):
-        more = chunk[lane + MODULUS * L] - modulus
-        if more > 0.0:
-            _row_norms(domains, waiting[lane], domains.volume[waiting[lane]] * more, rows)
+        b = chunk[lane + STRESS * L :: L]
+        _add_trace(domains, waiting[lane], b[0], b[1], b[2], b[3], b[4], b[5], traces)
         ratio = chunk[lane + RATIO * L]
         strain[0] += 1.0
         strain[2], strain[3] = min(strain[2], ratio), max(strain[3], ratio)
@@ -326,12 +308,12 @@ def _flush_rows(law, domains, waiting, chunk, rows, strain):
 
 
 @kernel(error_model='numpy')
-def add_tangent_rows(law, domains, elements, spans, chunks, u, rows, strain):
-    """Add to bounds of row sums what the tangent has more than the linear stiffness.
+def add_tangent_traces(law, domains, elements, spans, chunks, u, traces, strain):
+    """Add what the tangent has more than the linear stiffness to traces of 3x3 blocks.
 
     Args:
         law, domains, elements, spans, chunks, u: see `add_law_forces`.
-        rows: added to [N/m], shape (n,).
+        traces: added to [N/m], shape (n,).
         strain: output: number of domains and of elements beyond the tolerance, least and largest J
             of these domains, their least and largest principal stretch, shape (6,).
     """
@@ -352,12 +334,12 @@ def add_tangent_rows(law, domains, elements, spans, chunks, u, rows, strain):
             waiting[count] = i
             count += 1
             if count == LANES:
-                _flush_rows(law, domains, waiting, chunk, rows, strain)
+                _flush_traces(law, domains, waiting, chunk, traces, strain)
                 count = 0
-    _flush_rows(law, domains, waiting[:count], chunk, rows, strain)
+    _flush_traces(law, domains, waiting[:count], chunk, traces, strain)
     count = groups_beyond(elements, chunks, u, law.tolerance[1], law.candidates)
     groups = law.candidates[:count]
-    strain[1] = add_group_rows(law.elements, law.tolerance[1], elements, groups, u, rows)
+    strain[1] = add_group_traces(law.elements, law.tolerance[1], elements, groups, u, traces)
     law.counters[0] = 0
 
 

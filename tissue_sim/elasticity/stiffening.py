@@ -192,6 +192,35 @@ def _third_of_angle(c):
 
 
 @inner(error_model='numpy', inline='always')
+def tangent_factors(square, ratio, a, c, lam, b):
+    """Compute the factors of the tangent of the law without a branch.
+
+    With C = cof F, A = F - C / J and unit vectors e_i, its part along a vector G is, by i and k,
+    `steep` (A G)_i (A G)_k + `volumetric` (C G)_i (C G)_k + g |G|^2 e_i e_k.
+
+    Args:
+        square: |F|^2.
+        ratio: J.
+        a, c, lam, b: constants, see `stiffening_stress`.
+
+    Returns:
+        `steep`, `volumetric` and g [Pa], and 1 / J, continued as ln J is.
+    """
+    inside = max(ratio, MIN_RATIO)
+    slope = 1.0 / inside
+    log = series_logarithm(inside) + (ratio - inside) * slope
+    bent = 1.0 if ratio > MIN_RATIO else 0.0
+    bend = -bent * slope * slope
+    y = _above_zero(b * (square - 3.0 - 2.0 * log))
+    rise = a * series_exponential(y - _above_zero(y - MAX_EXPONENT))
+    own = c * series_exponential(y - _above_zero(y - MAX_OWN_EXPONENT))
+    g = rise + own
+    below, own_below = 1.0 if y < MAX_EXPONENT else 0.0, 1.0 if y < MAX_OWN_EXPONENT else 0.0
+    steep = 2.0 * b * (rise * below + own * own_below)
+    return steep, lam * (slope * slope + log * bend) - g * bend, g, slope
+
+
+@inner(error_model='numpy', inline='always')
 def tangent_modulus(h0, h1, h2, h3, h4, h5, h6, h7, h8, a, c, lam, b):
     """Compute the modulus of `tangent_bound` without a branch.
 
@@ -204,11 +233,6 @@ def tangent_modulus(h0, h1, h2, h3, h4, h5, h6, h7, h8, a, c, lam, b):
     """
     f0, f4, f8 = 1.0 + h0, 1.0 + h4, 1.0 + h8
     ratio = f0 * (f4 * f8 - h5 * h7) + h1 * (h5 * h6 - h3 * f8) + h2 * (h3 * h7 - f4 * h6)
-    inside = max(ratio, MIN_RATIO)
-    slope = 1.0 / inside
-    log = series_logarithm(inside) + (ratio - inside) * slope
-    bent, sign = 1.0 if ratio > MIN_RATIO else 0.0, 1.0 if ratio > 0.0 else -1.0
-    bend = -bent * slope * slope
     # C = F^T F and its eigenvalues
     c00, c11 = f0 * f0 + h3 * h3 + h6 * h6, h1 * h1 + f4 * f4 + h7 * h7
     c22 = h2 * h2 + h5 * h5 + f8 * f8
@@ -225,14 +249,8 @@ def tangent_modulus(h0, h1, h2, h3, h4, h5, h6, h7, h8, a, c, lam, b):
     low = _above_zero(mean - 2.0 * size * _third_of_angle(math.sqrt(abs(0.5 - 0.5 * half))))
     s1, s3 = math.sqrt(high), math.sqrt(low)
     s2 = math.sqrt(_above_zero(3.0 * mean - high - low))
-    y = _above_zero(b * (3.0 * mean - 3.0 - 2.0 * log))
-    rise = a * series_exponential(y - _above_zero(y - MAX_EXPONENT))
-    own = c * series_exponential(y - _above_zero(y - MAX_OWN_EXPONENT))
-    g = rise + own
-    below, own_below = 1.0 if y < MAX_EXPONENT else 0.0, 1.0 if y < MAX_OWN_EXPONENT else 0.0
-    steep = 2.0 * b * (rise * below + own * own_below)
-    volumetric = lam * (slope * slope + log * bend) - g * bend
-    turned = sign * slope
+    steep, volumetric, g, slope = tangent_factors(3.0 * mean, ratio, a, c, lam, b)
+    turned = slope if ratio > 0.0 else -slope
     away1, away2, away3 = s1 - turned * s2 * s3, s2 - turned * s1 * s3, s3 - turned * s1 * s2
     most1 = steep * away1 * away1 + volumetric * (s2 * s3) * (s2 * s3)
     most2 = steep * away2 * away2 + volumetric * (s1 * s3) * (s1 * s3)

@@ -18,6 +18,7 @@ from cutting_trainer.tissue_sim.elasticity.stiffening import (
     MIN_RATIO,
     series_exponential,
     series_logarithm,
+    tangent_factors,
     tangent_modulus,
 )
 
@@ -138,28 +139,64 @@ def law_in_lanes(chunk, constants, tolerance, keep):
     return total
 
 
-MODULUS, RATIO, MIN_STRETCH, MAX_STRETCH = _G, _Q, _SHARE, _PULL
-"""Slots of `tangents_in_lanes`: modulus [Pa], J, least and largest principal stretch."""
+RATIO, MIN_STRETCH, MAX_STRETCH = _Q, _SHARE, _PULL
+"""Slots of `tangents_in_lanes`: J, least and largest principal stretch."""
 
 
 @kernel(fastmath=SAFE_MATH, error_model='numpy')
 def tangents_in_lanes(chunk, constants):
-    """Compute the largest tangent modulus of the law in each lane, see `tangent_bound`.
+    """Compute what the tangent of the law has more than the linear one in each lane.
 
     Args:
-        chunk: h, changed, shape (SLOTS_OF_LAW LANES,).
+        chunk: h, changed, shape (SLOTS_OF_LAW LANES,). Output in the slots of the stress: the
+            matrix B [Pa], xx xy xz yy yz zz, with G^T B G the trace of the additional stiffness
+            along a vector G, see `tangent_factors`.
         constants: as for `stiffening_stress`.
     """
     L = LANES
     E = chunk[0 : SLOTS_OF_LAW * L]
     a, c, lam, b_law = constants[0], constants[1], constants[2], constants[3]
+    linear = 4.0 * (a + c) + lam
     for b in range(L):
-        modulus, ratio, least, most = tangent_modulus(
-            E[b], E[b + L], E[b + 2 * L], E[b + 3 * L], E[b + 4 * L], E[b + 5 * L],
-            E[b + 6 * L], E[b + 7 * L], E[b + 8 * L], a, c, lam, b_law,
+        h0, h1, h2 = E[b], E[b + L], E[b + 2 * L]
+        h3, h4, h5 = E[b + 3 * L], E[b + 4 * L], E[b + 5 * L]
+        h6, h7, h8 = E[b + 6 * L], E[b + 7 * L], E[b + 8 * L]
+        _, ratio, least, most = tangent_modulus(
+            h0, h1, h2, h3, h4, h5, h6, h7, h8, a, c, lam, b_law
+        )
+        f0, f4, f8 = 1.0 + h0, 1.0 + h4, 1.0 + h8
+        square = f0 * f0 + f4 * f4 + f8 * f8 + h1 * h1 + h2 * h2 + h3 * h3
+        square += h5 * h5 + h6 * h6 + h7 * h7
+        steep, volumetric, g, slope = tangent_factors(square, ratio, a, c, lam, b_law)
+        c0, c1, c2 = f4 * f8 - h5 * h7, h5 * h6 - h3 * f8, h3 * h7 - f4 * h6
+        c3, c4, c5 = h2 * h7 - h1 * f8, f0 * f8 - h2 * h6, h1 * h6 - f0 * h7
+        c6, c7, c8 = h1 * h5 - h2 * f4, h2 * h3 - f0 * h5, f0 * f4 - h1 * h3
+        a0, a1, a2 = f0 - slope * c0, h1 - slope * c1, h2 - slope * c2
+        a3, a4, a5 = h3 - slope * c3, f4 - slope * c4, h5 - slope * c5
+        a6, a7, a8 = h6 - slope * c6, h7 - slope * c7, f8 - slope * c8
+        more = 3.0 * g - linear
+        E[b + STRESS * L] = (
+            steep * (a0 * a0 + a3 * a3 + a6 * a6)
+            + volumetric * (c0 * c0 + c3 * c3 + c6 * c6) + more
         )  # fmt: skip
-        E[b + MODULUS * L], E[b + RATIO * L] = modulus, ratio
-        E[b + MIN_STRETCH * L], E[b + MAX_STRETCH * L] = least, most
+        E[b + (STRESS + 1) * L] = steep * (a0 * a1 + a3 * a4 + a6 * a7) + volumetric * (
+            c0 * c1 + c3 * c4 + c6 * c7
+        )
+        E[b + (STRESS + 2) * L] = steep * (a0 * a2 + a3 * a5 + a6 * a8) + volumetric * (
+            c0 * c2 + c3 * c5 + c6 * c8
+        )
+        E[b + (STRESS + 3) * L] = (
+            steep * (a1 * a1 + a4 * a4 + a7 * a7)
+            + volumetric * (c1 * c1 + c4 * c4 + c7 * c7) + more
+        )  # fmt: skip
+        E[b + (STRESS + 4) * L] = steep * (a1 * a2 + a4 * a5 + a7 * a8) + volumetric * (
+            c1 * c2 + c4 * c5 + c7 * c8
+        )
+        E[b + (STRESS + 5) * L] = (
+            steep * (a2 * a2 + a5 * a5 + a8 * a8)
+            + volumetric * (c2 * c2 + c5 * c5 + c8 * c8) + more
+        )  # fmt: skip
+        E[b + RATIO * L], E[b + MIN_STRETCH * L], E[b + MAX_STRETCH * L] = ratio, least, most
 
 
 @kernel(fastmath=SAFE_MATH, error_model='numpy')
@@ -294,44 +331,45 @@ def add_group_forces(constants, tolerance, elements, groups, u, f):
 
 
 @kernel(fastmath=SAFE_MATH, error_model='numpy')
-def _row_shares(chunk, shapes, least, mu):
-    """Compute V (modulus - 2 mu) sum_k |g_k| |g_j| of each lane beyond a tolerance."""
+def _trace_shares(chunk, shapes, least):
+    """Compute V G^T B G of each lane beyond a tolerance, at its four corners."""
     L = LANES
     E, S = chunk[0 : SLOTS_OF_LAW * L], shapes[0 : _SLOTS_OF_SHAPES * L]
     for b in range(L):
-        x1, y1, z1 = S[b], S[b + L], S[b + 2 * L]
-        x2, y2, z2 = S[b + 3 * L], S[b + 4 * L], S[b + 5 * L]
-        x3, y3, z3 = S[b + 6 * L], S[b + 7 * L], S[b + 8 * L]
-        x0, y0, z0 = x1 + x2 + x3, y1 + y2 + y3, z1 + z2 + z3
-        n0, n1 = math.sqrt(x0 * x0 + y0 * y0 + z0 * z0), math.sqrt(x1 * x1 + y1 * y1 + z1 * z1)
-        n2, n3 = math.sqrt(x2 * x2 + y2 * y2 + z2 * z2), math.sqrt(x3 * x3 + y3 * y3 + z3 * z3)
         counts = 1.0 if E[b + _SQUARE * L] >= least else 0.0
-        more = counts * E[b + VOLUME * L] * (E[b + MODULUS * L] - 2.0 * mu) * (n0 + n1 + n2 + n3)
+        share = counts * E[b + VOLUME * L]
+        xx, xy, xz = E[b + STRESS * L], E[b + (STRESS + 1) * L], E[b + (STRESS + 2) * L]
+        yy, yz, zz = E[b + (STRESS + 3) * L], E[b + (STRESS + 4) * L], E[b + (STRESS + 5) * L]
+        x0, y0, z0 = 0.0, 0.0, 0.0
+        for a in range(3):
+            x, y, z = S[b + 3 * a * L], S[b + (3 * a + 1) * L], S[b + (3 * a + 2) * L]
+            x0, y0, z0 = x0 + x, y0 + y, z0 + z
+            off = xy * x * y + xz * x * z + yz * y * z
+            S[b + (10 + a) * L] = share * (xx * x * x + yy * y * y + zz * z * z + 2.0 * off)
+        off = xy * x0 * y0 + xz * x0 * z0 + yz * y0 * z0
+        S[b + 9 * L] = share * (xx * x0 * x0 + yy * y0 * y0 + zz * z0 * z0 + 2.0 * off)
         E[b + _TRACE * L] = counts
-        S[b + 9 * L], S[b + 10 * L] = more * n0, more * n1
-        S[b + 11 * L], S[b + 12 * L] = more * n2, more * n3
 
 
 @kernel(error_model='numpy')
-def add_group_rows(constants, tolerance, elements, groups, u, rows):
-    """Add to bounds of row sums what the tangent of some groups has more than the linear one.
+def add_group_traces(constants, tolerance, elements, groups, u, traces):
+    """Add what the tangent of some groups has more than the linear one to traces of 3x3 blocks.
 
     Args:
         constants, tolerance, elements, groups, u: see `add_group_forces`.
-        rows: added to [N/m], shape (n,).
+        traces: added to [N/m], shape (n,).
 
     Returns:
         Number of elements beyond the tolerance.
     """
     L, many, count = LANES, LANES // GROUP, 0
     chunk, shapes = np.zeros(SLOTS_OF_LAW * L), np.zeros(_SLOTS_OF_SHAPES * L)
-    mu = constants[0] + constants[1]
     for low in range(0, groups.shape[0], many):
         some = groups[low : low + many]
-        _gather(elements, some, u, mu, chunk, shapes)
+        _gather(elements, some, u, constants[0] + constants[1], chunk, shapes)
         _measures(chunk)
         tangents_in_lanes(chunk, constants)
-        _row_shares(chunk, shapes, tolerance * tolerance, mu)
+        _trace_shares(chunk, shapes, tolerance * tolerance)
         for which in range(some.shape[0]):
             corner = 4 * (some[which] // L) * L + some[which] % L
             for b in range(GROUP):
@@ -341,5 +379,5 @@ def add_group_rows(constants, tolerance, elements, groups, u, rows):
                 count += 1
                 for a in range(4):
                     node = elements.corners[corner + a * L + b] // 3
-                    rows[node] += shapes[lane + (9 + a) * L]
+                    traces[node] += shapes[lane + (9 + a) * L]
     return count

@@ -131,7 +131,7 @@ class Dynamics:
         self._uncut = self._frequency.omega
         self._stiffened: StiffenedMass | None = None
         if self.model.lawful:
-            self._stiffened = StiffenedMass(self.model, unscaled, mesh.fixed == 0, growth)
+            self._stiffened = StiffenedMass(self.model, unscaled, self._inverse, growth)
         self._bounds: dict[float, float] = {}
         self._still = 0
         self._elastic = ElasticState(self.model)
