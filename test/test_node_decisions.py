@@ -20,8 +20,10 @@ from cutting_trainer.haptic_bridge.emulated_arm.faults import DriverFaults
 from cutting_trainer.haptic_bridge.emulated_arm.node import ArmNode
 from cutting_trainer.node_common.lifecycle import ManagedNode
 from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.tissue_sim import node as tissue_node
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.node import TissueSimNode
 from cutting_trainer.tissue_sim.streaming import link_budget
 from cutting_trainer.tissue_sim.streaming.link_budget import LinkBudget
 from cutting_trainer.tissue_sim.streaming.messages import mesh_message
@@ -137,6 +139,22 @@ def test_a_node_that_ends_rests_if_it_works_and_gives_back_what_it_configured(ac
 def test_a_replica_without_a_mesh_is_of_no_revision_and_no_connectivity() -> None:
     replica = MeshReplica()
     assert (replica.revision, replica.topology, len(replica.rest)) == (-1, -1, 0)
+
+
+def test_a_tissue_that_was_reset_goes_on_whole_though_a_follower_knows_the_cut_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The revision says which mesh is the newer one; a reset begins the topology anew."""
+    mesh = TetMesh(*box((1, 1, 1), 0.01))
+    known = [mesh_message(mesh, np.zeros((8, 3)), '', revision, 4, 0) for revision in (41, 42)]
+    known[0].topology = 6
+    for found in (known, known[::-1]):
+        monkeypatch.setattr(tissue_node, 'recover_meshes', lambda _, found=found: found)
+        logger = SimpleNamespace(warning=lambda _: None)
+        node: Any = SimpleNamespace(_file=None, get_logger=lambda logger=logger: logger)
+        before = TissueSimNode._tissue_before(node)
+        assert before is not None
+        assert (before.revision, before.topology) == (42, 0)
 
 
 def cutting(revision: int) -> Any:

@@ -19,7 +19,7 @@ from cutting_trainer.node_common.parameters import (
     seed_parameter,
 )
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
-from cutting_trainer.node_common.stamps import REVISION_MODULUS
+from cutting_trainer.node_common.stamps import REVISION_MODULUS, newer
 from cutting_trainer.node_common.timing import (
     FRAME_NICENESS,
     FairLock,
@@ -111,7 +111,7 @@ class TissueSimNode(ManagedNode):
         """Return the tissue of the previous node of this name, as its followers know it."""
         newest = MeshReplica()
         for mesh in (*recover_meshes(self), *(read_checkpoint(self._file) if self._file else [])):
-            if (mesh.topology, mesh.revision) > (newest.topology, newest.revision):
+            if newer(mesh.revision, newest.revision):
                 newest.load(mesh)
         if newest.revision < 0:
             self.get_logger().warning('nobody knows the tissue as it was: it begins whole')
