@@ -100,7 +100,7 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
     page.press('reset-e-stop')
     page.wait(lambda: not page.state()['eStopped'], 'the reset')
     keep('reset', picture=False)
-    cut(page, BEGIN, END)
+    cut(page, np.linspace(BEGIN, END, 12))
     page.mouse('mouseReleased', *page.pixels(END[None])[0])
     time.sleep(0.7)
     keep('cut')
