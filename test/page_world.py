@@ -82,7 +82,6 @@ class StandIn:
         self._open_a_cut()
         self.tip = np.array([*positions.mean(axis=0)[:2], positions[:, 2].max() + 0.02])
         self.goal = self.tip.copy()
-        self.frame = 0
         self.state, self.e_stopped, self.recording = 'DISABLED', False, ''
         self.clutched = False
         self._mode, self._says = mode, says
@@ -103,8 +102,6 @@ class StandIn:
         self._sources = [TissueSource('tissue'), TissueSource('computed')]
         self._ends = threading.Event()
         self.stands_still = threading.Event()
-        self.tissue_waits = threading.Event()
-        self.hand_is_held = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self.greet()
         self._thread.start()
@@ -206,8 +203,7 @@ class StandIn:
             self._tick(time.monotonic() - began)
 
     def _tick(self, now: float) -> None:
-        self.frame += not self.tissue_waits.is_set()
-        way = (self.goal - self.tip) * (not self.hand_is_held.is_set())
+        way = self.goal - self.tip
         length = float(np.linalg.norm(way))
         self.tip = self.tip + way * min(1.0, SPEED * PERIOD / max(length, 1e-9))
         top = self.positions[:, 2].max()
@@ -226,7 +222,6 @@ class StandIn:
             proxy=[*self.tip[:2].tolist(), max(float(self.tip[2]), float(top))],
             force=force,
             depth=depth,
-            frame=self.frame,
             can_guide=self.state == 'ENABLED',
             contact=int(depth > 0),
             clutched=self.clutched,

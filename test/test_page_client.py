@@ -229,37 +229,6 @@ def test_no_cut_begins_or_goes_on_in_an_old_picture(browser: Browser) -> None:
         page.mouse('mouseReleased', *places[1])
 
 
-def test_a_cut_goes_on_with_the_frames_of_the_tissue_and_not_far_before_the_blade(
-    browser: Browser,
-) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        begin, end = (on_top(stand_in, x, -0.008) for x in (-0.013, 0.013))
-        places = page.pixels(np.array([begin, end]))
-
-        def goal() -> np.ndarray:
-            return end_of_blade(stand_in.of(Guide)[-1])
-
-        page.mouse('mouseMoved', *places[0])
-        stand_in.wait(lambda: np.allclose(stand_in.tip, begin + 0.008 * UP, atol=1e-3))
-        page.mouse('mousePressed', *places[0], pressed=True)
-        stand_in.wait(lambda: goal()[2] < begin[2] - 0.021)  # it does not go in, and is pushed on
-        stand_in.tissue_waits.set()
-        page.mouse('mouseMoved', *places[1], pressed=True)
-        time.sleep(1.0)
-        assert goal()[0] < begin[0] + 0.013  # 0.12 m/s in the 0.1 s that were seen
-        stand_in.hand_is_held.set()
-        stand_in.tissue_waits.clear()
-        blade = stand_in.tip[0]
-        stand_in.wait(lambda: goal()[0] > blade + 0.009)
-        time.sleep(1.0)
-        assert goal()[0] < blade + 0.0105
-        stand_in.hand_is_held.clear()
-        stand_in.wait(lambda: goal()[0] > blade + 0.012)
-        page.mouse('mouseReleased', *places[1])
-
-
 def test_no_goal_jumps_and_the_edge_turns_to_the_stroke(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:

@@ -202,14 +202,7 @@ class LivePage:
         depth = force = 0.0
         if moment is not None and moment.is_finite:
             force, depth = float(np.linalg.norm(moment.force)), self._depth(moment)
-            put_moment(
-                self._server,
-                moment,
-                depth,
-                frame=replica.step,
-                can_guide=can_guide,
-                further=further,
-            )
+            put_moment(self._server, moment, depth, can_guide=can_guide, further=further)
             self._show_progress(now, replica, moment)
         self._history.add(now, force, depth, *rates)
         if now >= self._next_plot:
@@ -309,7 +302,6 @@ def put_moment(
     depth: float,
     *,
     can_guide: bool,
-    frame: int = 0,
     further: Sequence[dict[str, Any] | None] = (),
 ) -> None:
     """Show the pose of the tool and the force on the hand.
@@ -319,7 +311,6 @@ def put_moment(
         moment: to show; a moment that is not finite is skipped.
         depth: of the blade's end [m].
         can_guide: whether the hand follows goals.
-        frame: number of the newest frame of the tissue; a replay needs none.
         further: tip [m] and wxyz of each further tool; None: it is not known.
     """
     if not moment.is_finite:
@@ -331,7 +322,6 @@ def put_moment(
         proxy=None if moment.contact == INSIDE else moment.proxy.tolist(),
         force=moment.force.tolist(),
         depth=depth,
-        frame=frame,
         can_guide=can_guide,
         contact=moment.contact,
         clutched=moment.clutched,

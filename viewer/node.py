@@ -29,7 +29,7 @@ from cutting_trainer.node_common.output import announce
 from cutting_trainer.node_common.parameters import parameter, scene_parameter
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.share_folder import scene_names
-from cutting_trainer.node_common.timing import PeriodicLoop, request_preference
+from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.streaming.mesh_follower import MeshFollower
 from cutting_trainer.tissue_sim.streaming.reset_client import ResetClient
@@ -65,8 +65,7 @@ MARKER_PERIOD_S = 0.1
 """[s] between two marker messages."""
 RATE_HZ = 30.0
 """[Hz] Largest update rate of the page."""
-_NICENESS = -5
-"""That of the recorder: the way of the mouse goes through the page, yet the loop comes first."""
+_NICENESS = 10
 RECORDER = 'recorder'
 OPEN_LINK_WARNING = (
     '(whoever has this link and reaches this machine can operate the session, and nothing is '
@@ -183,7 +182,6 @@ class ViewerNode(ManagedNode):
 
     def work(self, stop: Stop) -> None:
         """Update the page in a loop."""
-        self.get_logger().info(request_preference(_NICENESS))
         if self._launched and self._listener is None:
             self._listener = threading.Thread(target=self._listen, daemon=True)
             self._listener.start()
@@ -361,6 +359,9 @@ class ViewerNode(ManagedNode):
 
 def main() -> None:
     """Run the node."""
+    # The viewer has a lower priority than the nodes of the loop. Set first: existing threads, such
+    # as the one that serves the pages, would keep theirs.
+    os.nice(_NICENESS)
     run(ViewerNode)
 
 

@@ -16,7 +16,7 @@ the one before:
 | nodes | rows of name, level, message, rate |
 | session | scene, method, recording, busy, scenes |
 | scale | value, min, max |
-| moment | tip, wxyz, proxy, force, depth, frame, can_guide, contact, clutched, further: tip and wxyz of each further tool, null where it is not known |
+| moment | tip, wxyz, proxy, force, depth, can_guide, contact, clutched, further: tip and wxyz of each further tool, null where it is not known |
 | plots | span, lines of title, unit, times, values and colours by name, least |
 | playhead | time, playing, speed |
 | attempt | rows of name, value, over; score: null, or points, passed, reasons once the attempt is over |

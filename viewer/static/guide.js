@@ -9,8 +9,6 @@ const NOTCH = 0.0005; // [m] of the wheel
 const STEP = 0.0005, LONG_STEP = 0.002; // [m] of a key, with Shift
 const ROTATION_STEP = Math.PI / 60; // of a key
 const DOWN = 0.04, UP = 0.15, STROKE = 0.12; // [m/s] of the goal: down, up, along a cut
-const MAX_STEP = 0.1, FRAME = 1 / 30; // [s] of one step; of a cut for each frame of the tissue that is seen
-const LEAD = 0.01; // [m] of the goal of a cut before the blade as it is seen
 const MAX_PUSH = 0.016; // [m] beyond the depth, until the blade goes in: hand and tissue yield
 const NEAR = 0.005; // [m] beside the place of a cut from where the blade goes down
 const FAR = 0.012, MAX_LIFT = 0.02; // [m] of a way from which the blade is lifted over the tissue
@@ -274,10 +272,9 @@ export class Guide {
     clearTimeout(this._timer);
     this._timer = null;
     const now = performance.now(), { moment } = this._stage;
-    const passed = clamp((now - (this._last ?? now - PERIOD_MS)) / 1000, [0.001, MAX_STEP]);
+    const dt = Math.min(0.1, Math.max(0.001, (now - (this._last ?? now - PERIOD_MS)) / 1000));
     this._last = now;
     if (this.goal === null || moment === null) return;
-    const dt = this._pace(passed, moment.frame);
     this._next = now + PERIOD_MS;
     if (this.cutting && this._isOld()) { // whether the blade is in is not known
       this._timer = setTimeout(() => this._advance(), PERIOD_MS);
@@ -285,9 +282,8 @@ export class Guide {
     }
     const end = new Vector3().fromArray(moment.tip).add(this._toEnd());
     const way = Math.hypot(end.x - this._aim.point.x, end.y - this._aim.point.y);
-    const lead = this.goal.position.clone().add(this._toEnd()).sub(end);
-    const sinks = this._down(dt, way, LEAD + lead.z, moment.contact === INSIDE);
-    const moves = this._along(dt, LEAD - Math.hypot(lead.x, lead.y)) || sinks || way > FAR;
+    const sinks = this._down(dt, way, moment.contact === INSIDE);
+    const moves = this._along(dt) || sinks || way > FAR;
     const lift = this.cutting ? 0 : clamp(way - FAR, [0, MAX_LIFT]);
     this.goal.position.copy(this._aim.point).addScaledVector(this._aim.normal, this._level)
       .addScaledVector(Z, lift).sub(this._toEnd());
@@ -297,22 +293,11 @@ export class Guide {
     if (moves) this._timer ??= setTimeout(() => this._advance(), PERIOD_MS);
   }
 
-  /** The time of a step [s]: in a cut it passes with the frames of the tissue, as a hand waits for the picture. */
-  _pace(passed, frame) {
-    this._due = clamp((this._due ?? 0) + FRAME * (frame - (this._frame ?? frame)), [0, MAX_STEP]);
-    this._frame = frame;
-    if (!this.cutting) return passed;
-    const dt = Math.min(passed, this._due);
-    this._due -= dt;
-    return dt;
-  }
-
-  /** Moves the level to that of the cut, or of the height, with so much room below [m]; returns whether it goes on. */
-  _down(dt, way, room, inside) {
+  /** Moves the level to that of the cut, or of the height; returns whether it goes on. */
+  _down(dt, way, inside) {
     if (this.cutting && way > NEAR && this._level > 0 && this._push === 0) return true; // not there yet
     const wanted = this.cutting ? -this.depth - this._push : this.height;
-    const low = this.cutting ? Math.max(0, Math.min(DOWN * dt, room)) : DOWN * dt;
-    const step = clamp(wanted - this._level, [-low, UP * dt]);
+    const step = clamp(wanted - this._level, [-DOWN * dt, UP * dt]);
     this._level += step;
     if (!this.cutting) return Math.abs(wanted - this._level) > 1e-6;
     this._entered ||= inside;
@@ -321,12 +306,12 @@ export class Guide {
     return true;
   }
 
-  /** Follows the path of a cut, the edge ahead, by a length at most [m]; returns whether it goes on. */
-  _along(dt, most) {
+  /** Follows the path of a cut, the edge ahead; returns whether it goes on. */
+  _along(dt) {
     if (!this.cutting) return false;
     // The blade waits where it goes in.
     const goes = this._entered || this._push === MAX_PUSH || !this._stage.tool.cuts;
-    let left = goes ? Math.min(STROKE * dt * this._head(dt), most) : 0;
+    let left = goes ? STROKE * dt * this._head(dt) : 0;
     while (this._path.length > 0 && left > 0) {
       const next = this._path[0], far = next.point.distanceTo(this._aim.point);
       const share = Math.min(1, left / Math.max(far, 1e-12));
