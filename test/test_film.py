@@ -6,7 +6,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from cutting_trainer.recordings.film_command import FilmOptions, make_film, picture_times
 from cutting_trainer.recordings.headless_browser import CHROMIUM
@@ -48,8 +48,9 @@ def test_a_film_has_the_pictures_of_its_times_and_the_tissue_is_opened_in_it(
 def test_a_gif_runs_as_long_as_the_session(tmp_path: Path) -> None:
     count, _ = film(tmp_path / 'cut.gif', 2.0, 3.0)
     with Image.open(tmp_path / 'cut.gif') as made:
-        assert made.n_frames == count == 6
-        assert made.info['duration'] == 200 and made.size == SIZE
+        assert made.n_frames > 1 and made.size == SIZE
+        lengths = [frame.info['duration'] for frame in ImageSequence.Iterator(made)]
+    assert count == 6 and sum(lengths) == 200 * count, 'equal pictures may be one that lasts longer'
 
 
 def test_what_cannot_be_filmed_is_refused_in_a_sentence(tmp_path: Path) -> None:
