@@ -17,7 +17,7 @@ from cutting_trainer.tissue_sim.motion.stability import highest_square
 MAX_GROWTH = 2.0
 """Largest frequency of the step, as a multiple of that of the unstrained tissue."""
 _STRAINED = 2.0
-"""Factor of `StiffenedMass` in a strained tissue: 0.9 to 1.9 in random meshes with nu 0.3 and 0.45,
+"""Factor of `StiffenedMass` in a strained tissue: 0.9 to 1.9 in a random mesh with nu 0.3 and 0.45,
 pulled, pressed and twisted."""
 SUBSTEPS_BETWEEN = 16
 """Substeps between two adaptations."""
@@ -80,8 +80,8 @@ class StiffenedMass:
     """Frequency and inverse masses of a tissue with the stiffening law.
 
     Let D have the traces of the 3x3 blocks on the diagonal of K. D follows cuts and strain. Power
-    iterations find the least factor with K <= factor D in the unstrained tissue; strain brings it
-    up to `_STRAINED` at most, if it is lower.
+    iterations find the least factor with K <= factor D in the unstrained tissue. Strain changes it;
+    it is taken as `_STRAINED` at least. This is measured, and proved for no mesh.
 
     Args:
         model: with a law.
