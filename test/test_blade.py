@@ -73,11 +73,13 @@ def draw(simulation: TissueSimulation, tips: np.ndarray) -> Iterator[Frame]:
         yield simulation.frame(contact_at(simulation, tip))
 
 
-def area_in_tissue(sweep: Sweep) -> float:
-    """Area of a sweep over the lowest 10 of the 30 mm of the edge [m^2]."""
-    before = sweep.tip_from + (sweep.root_from - sweep.tip_from) / 3
+def area_in_tissue(last: Sweep, sweep: Sweep) -> float:
+    """Area from the end of the last sweep to that of the next, over the lowest 10 of the 30 mm of
+    the edge [m^2].
+    """
+    before = last.tip_to + (last.root_to - last.tip_to) / 3
     after = sweep.tip_to + (sweep.root_to - sweep.tip_to) / 3
-    return Sweep(before, sweep.tip_from, after, sweep.tip_to).area
+    return Sweep(before, last.tip_to, after, sweep.tip_to).area
 
 
 def path(*corners: tuple[float, float, float], speed: float = 0.04) -> np.ndarray:
@@ -115,9 +117,10 @@ def test_the_area_that_is_asked_for_is_the_area_that_is_swept_and_sweeps_join() 
             simulation.cut_done()
     # Before, the blade goes in, and drags the tissue along until it yields.
     steady = [sweep for step, sweep in zip(steps, sweeps, strict=True) if step > 300]
-    swept = steady[-1].tip_to[0] - steady[0].tip_from[0]
+    swept = steady[-1].tip_to[0] - steady[0].tip_to[0]
     assert swept > 0.015
-    assert sum(map(area_in_tissue, steady)) == pytest.approx(swept * 0.01, rel=0.02)
+    asked = sum(area_in_tissue(*pair) for pair in itertools.pairwise(steady))
+    assert asked == pytest.approx(swept * 0.01, rel=0.02)
     joints = [
         np.linalg.norm(sweeps[i].tip_to - sweeps[i + 1].tip_from)
         for i in range(20, len(sweeps) - 1)

@@ -29,6 +29,7 @@ from cutting_trainer.tissue_sim.mesh.locate import NearElements, locate_points
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, tetrahedron_volumes
 
 _MIN_AREA = 1e-8
+_MIN_WAY = 1e-12
 _MEDIAN_SAMPLES = 20000
 """Elements in the sample for a median."""
 _ONE_WAY = 0.3
@@ -200,20 +201,22 @@ class Blade:
         self._cut_tip, self._cut_edge = self._cut_tip + moved[0], self._cut_edge + moved[1]
 
     def tie(self, mesh: TetMesh, near: NearElements, positions: np.ndarray) -> None:
-        """Tie the edge from which the next sweep starts to the tissue: sweeps join in it.
+        """Tie the edge from which the next sweep starts to the tissue, unless it is: sweeps join in
+        it.
 
         Args:
             mesh: the tissue.
             near: its tetrahedra.
             positions: nodes now [m], shape (n, 3).
         """
+        if self._from is not None:
+            return
         points = points_of(np.array([self._cut_tip + self._cut_edge, self._cut_tip]))
         among = near.find(positions, points.min(axis=0), points.max(axis=0))
         found, weights = np.empty(POINTS, np.int64), np.empty((POINTS, 4))
         tets, hint = mesh.tetrahedra, self._state.hint[0]
         locate_points(positions, tets, mesh.neighbors, among, points, hint, found, weights)
         inside = found >= 0
-        self._from = None
         if inside.any():
             corners = tets[found[inside]].astype(np.int64)
             self._from = Anchor(corners, weights[inside], points[inside], SHARES[inside])
@@ -361,11 +364,33 @@ class Blade:
         self.immersed = length * float(spans.sum())
 
     def sweep(self) -> Sweep | None:
-        """Return the sweep of the edge since the last `confirm_sweep`; None if it is negligible."""
-        sweep = Sweep(
-            self._cut_tip + self._cut_edge, self._cut_tip, self._tip + self._edge, self._tip
-        )
-        return sweep if sweep.area > _MIN_AREA else None
+        """Return the sweep of the edge since the last `confirm_sweep`; None if it is negligible.
+
+        The tissue bends the edge at which the last sweep ended. The sweep is straight, and starts
+        behind all of it: no edge of the mesh slips through between the two.
+        """
+        tip, root = self._cut_tip, self._cut_tip + self._cut_edge
+        tip_to, root_to = self._tip, self._tip + self._edge
+        if Sweep(root, tip, root_to, tip_to).area <= _MIN_AREA:
+            return None
+        way = np.array([root_to - root, tip_to - tip])
+        way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _MIN_WAY)
+        back = way * self._gap(way)
+        return Sweep(root - back[0], tip - back[1], root_to, tip_to)
+
+    def _gap(self, way: np.ndarray) -> float:
+        """Return by how much the straight start of a sweep is ahead of the bent one [m].
+
+        Args:
+            way: unit vectors of the motion of root and tip, shape (2, 3).
+        """
+        if self._from is None or not len(self._from.points):
+            return 0.0
+        shares = self._from.shares[:, None]
+        ahead = self._cut_tip + shares * self._cut_edge - self._from.points
+        along = way[1] + shares * (way[0] - way[1])
+        over = (ahead * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), _MIN_WAY)
+        return max(float(over.max()), 0.0)
 
     def confirm_sweep(self) -> None:
         """Start the next sweep from the present edge."""
