@@ -16,6 +16,9 @@ PERIOD_S = 0.5
 _MAX_LOAD = 0.05
 """Largest share of one processor: a report takes longer as the attempt grows."""
 _MAX_REASONS = 6
+_LAST_FRAMES = 6
+"""Frames of the tissue after the end of the motion until the last cut is in the mesh: its sweep,
+the end of its stroke, and the answer to each take one, and two may be under way."""
 
 
 class AttemptProgress:
@@ -36,6 +39,7 @@ class AttemptProgress:
         self._motion: list[np.ndarray] = []
         self._forces: list[tuple[float, float]] = []
         self._step = self._topology = -1
+        self._over_at: int | None = None
         self._next = 0.0
 
     def see(self, now: float, replica: MeshReplica, moment: Moment) -> dict[str, Any] | None:
@@ -67,8 +71,10 @@ class AttemptProgress:
             self._topology = replica.topology
             attempt.see_tissue(now, replica)
         measures = attempt.measures()
+        if attempt.over and self._over_at is None:
+            self._over_at = replica.step
         found = None
-        if attempt.over:
+        if self._over_at is not None and replica.step >= self._over_at + _LAST_FRAMES:
             result = score(self._exercise, measures)
             found = {
                 'points': f'{result.points:.1f}',
