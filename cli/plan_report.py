@@ -75,6 +75,8 @@ def _chosen(chosen: Candidate, found: Plan) -> list[str]:
         lines.append(
             f'  at most {ms(worst.frame)} when cuts have shortened the step: {_steps(worst)}'
         )
+    if chosen.cutting:
+        lines.append(f'  {ms(chosen.cutting)} while a blade is drawn through the tissue')
     return lines
 
 
@@ -115,8 +117,8 @@ def as_data(scene: str, settings: TissueSettings, found: Plan) -> dict[str, Any]
 
     Returns:
         scene, tetrahedra, budget and available [s] that were asked; chosen with errors by cause
-        and cost, also when cuts have shortened the step; rejected; remedies; a caution, empty where
-        there is none; what the scene takes.
+        and cost, also when cuts have shortened the step, and in a cut (0: none); rejected;
+        remedies; a caution, empty where there is none; what the scene takes.
     """
     chosen = None
     if found.chosen is not None and found.worst is not None:
@@ -128,6 +130,7 @@ def as_data(scene: str, settings: TissueSettings, found: Plan) -> dict[str, Any]
             'errors': {**asdict(c.errors), 'total': c.errors.total},
             'cost': {**asdict(c.cost), 'frame': c.cost.frame},
             'cost_after_cuts': {**asdict(found.worst), 'frame': found.worst.frame},
+            'frame_in_a_cut': c.cutting,
         }
     return {
         'scene': scene,

@@ -5,6 +5,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from meshes import box
 
@@ -13,16 +14,20 @@ from bench.accuracy.quadratic import QuadraticTissue
 from cutting_trainer.cli.plan_report import as_data, report
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation, make_task
+from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+from cutting_trainer.tissue_sim.planner import frame_cost as costs
 from cutting_trainer.tissue_sim.planner.budget import Budget
 from cutting_trainer.tissue_sim.planner.candidate import Candidate, Cost, ErrorEstimate, Task
 from cutting_trainer.tissue_sim.planner.far_field_choice import far_field
-from cutting_trainer.tissue_sim.planner.frame_cost import frame_cost
+from cutting_trainer.tissue_sim.planner.frame_cost import frame_cost, with_blade
 from cutting_trainer.tissue_sim.planner.indentation import places
 from cutting_trainer.tissue_sim.planner.memory import recall, remember
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 pytestmark = pytest.mark.long
 
@@ -165,6 +170,54 @@ def test_what_else_the_machine_does_during_a_stroke_is_not_counted_as_cost(
         monkeypatch.setattr(time, 'thread_time', lambda busy=busy: tick(busy))
         costs.append(frame_cost(task, 'linear', integrator, 0.001).frame)
     assert costs[1] == pytest.approx(costs[0])
+
+
+def block_task() -> tuple[Task, Candidate]:
+    """The thesis's block with its method, and the time of a whole core."""
+    task = task_on_a_core('block')
+    at_rest = ErrorEstimate(0.1, 0.0, 0.0)
+    return task, Candidate('linear_smoothed', 'symplectic_euler', at_rest, Cost(20, 1e-3, 1e-3, 0))
+
+
+def test_the_blade_of_the_plan_pays_for_its_way_at_the_depth_of_the_tool(block: TetMesh) -> None:
+    tough = Resistance(1e-6, 20.0, 0.0)
+    task = replace(block_task()[0], mesh=block, material=GEL, resistance=tough)
+    task = replace(task, budget=Budget(contact_radius=0.008))
+    simulation = TissueSimulation(block, GEL, tough, model='linear_smoothed')
+    forces, depth = [], 0.008
+    for contact in costs._drawn(task):
+        frame = simulation.frame(contact)
+        if frame.command is not None:
+            simulation.cut_done()
+        forces.append(float(np.linalg.norm(frame.force)))
+    assert simulation.blade is not None
+    assert np.median(forces[-10:]) == pytest.approx(tough.toughness * depth, rel=0.2)
+    assert simulation.blade.paid > 0.3 * tough.toughness * depth * 0.03  # the tissue yields first
+
+
+def test_a_scene_without_cuts_has_no_cost_of_a_cut() -> None:
+    task, candidate = block_task()
+    assert with_blade(task, candidate).cutting > 0.0
+    whole = replace(task, budget=task.budget.model_copy(update={'cuts': False}))
+    assert with_blade(whole, candidate).cutting == 0.0
+
+
+def test_a_method_whose_frames_in_a_cut_take_too_long_does_not_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task, _ = block_task()
+
+    def timed(simulation: TissueSimulation, contact: ToolContact | None) -> tuple[Frame, float]:
+        frame = simulation.frame(contact)
+        return frame, 1e-3 if simulation.blade is None else 0.04
+
+    monkeypatch.setattr(costs, '_timed', timed)
+    none = plan(task)
+    assert none.chosen is None
+    dear = [r for r in none.rejected if '40 ms a frame while a blade is drawn, of 33 ms' in r.why]
+    assert {r.method.rsplit(' by ')[1] for r in dear} >= {'symplectic_euler', 'implicit'}
+    whole = plan(replace(task, budget=task.budget.model_copy(update={'cuts': False})))
+    assert whole.chosen is not None and whole.chosen.cutting == 0.0
 
 
 def far_task(error: float) -> tuple[Task, Candidate]:

@@ -42,6 +42,7 @@ def test_the_method_is_announced_with_what_it_costs_and_the_others_with_why_not(
         'method': CHOSEN.name,
         'predicted_error': CHOSEN.errors.total,
         'predicted_frame': pytest.approx(0.012),
+        'predicted_cut_frame': 0.0,
         'allowed_frame': 0.02,
     }
 

@@ -37,11 +37,12 @@ class Anchor(NamedTuple):
         if not len(self.points):
             return np.zeros((2, 3)), self
         points = np.einsum('pk,pkc->pc', self.weights, positions[self.corners])
-        degree = 1 if len(points) >= _MIN_POINTS else 0
-        line = np.zeros((2, 3))
-        line[: degree + 1] = np.polynomial.polynomial.polyfit(
-            self.shares, points - self.points, degree
-        )
+        moved, shares = points - self.points, self.shares
+        line = np.array([moved.mean(axis=0), np.zeros(3)])
+        if len(points) >= _MIN_POINTS:  # the line with the least squares of distances
+            off = shares - shares.mean()
+            line[1] = off @ moved / (off @ off)
+            line[0] -= shares.mean() * line[1]
         return line, self._replace(points=points)
 
     def loose(self) -> 'Anchor':

@@ -83,13 +83,19 @@ class Cost:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A method with its errors and cost on the scene."""
+    """A method with its errors and cost on the scene.
+
+    Attributes:
+        cost: of a frame under a tool that presses.
+        cutting: CPU time of a frame in which a blade is drawn [s]; 0: not measured.
+    """
 
     model: ModelName
     integrator: IntegratorName
     errors: ErrorEstimate
     cost: Cost
     active: ActiveSettings = field(default=ActiveSettings())
+    cutting: float = 0.0
 
     @property
     def name(self) -> str:
@@ -134,10 +140,14 @@ class Task:
         growth = self.stepping.frequency_growth if self.budget.cuts and explicit else 1.0
         return candidate.cost.grown(max(growth, 1.0))
 
+    def dearest(self, candidate: Candidate) -> float:
+        """Return the CPU time of the dearest frame of a method [s]."""
+        return max(self.worst(candidate).frame, candidate.cutting)
+
     def in_time(self, candidate: Candidate) -> bool:
         """Return whether a method meets the allowed cost."""
-        cost = self.worst(candidate)
-        return cost.substeps <= self.stepping.max_substeps and cost.frame <= self.available
+        substeps = self.worst(candidate).substeps
+        return substeps <= self.stepping.max_substeps and self.dearest(candidate) <= self.available
 
     def fits(self, candidate: Candidate) -> bool:
         """Return whether a method meets the allowed cost and error."""

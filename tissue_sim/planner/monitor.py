@@ -47,6 +47,7 @@ class PlanMonitor:
                 f'method: {chosen.name}; '
                 f'error {percent(chosen.errors.total)} ({by_cause(chosen.errors)}), '
                 f'{ms(chosen.cost.frame)} a frame of {ms(self._plan.available)}'
+                + (f', {ms(chosen.cutting)} in a cut' if chosen.cutting else '')
             )
         return said
 
@@ -68,5 +69,6 @@ class PlanMonitor:
             'method': chosen.name,
             'predicted_error': chosen.errors.total,
             'predicted_frame': chosen.cost.frame,
+            'predicted_cut_frame': chosen.cutting,
             'allowed_frame': self._plan.available,
         }

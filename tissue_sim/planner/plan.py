@@ -14,6 +14,7 @@ from cutting_trainer.tissue_sim.planner.far_field_choice import far_field
 from cutting_trainer.tissue_sim.planner.frame_cost import (
     frame_cost,
     tool_depth,
+    with_blade,
     with_sleepers,
 )
 from cutting_trainer.tissue_sim.planner.mesh_errors import Probing, probe
@@ -113,9 +114,18 @@ def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
         candidates = _candidates(task, model, errors, probing, depth, say)
         found = sorted(candidates, key=lambda c: c.cost.frame)
         rejected += [unfit(task, c) for c in found if not task.fits(c)]
-        tried += found
         fitting = [c for c in found if task.fits(c)]
-        best = _lighter(task, _preferred(task, fitting), depth, rejected) if fitting else None
+        best = None
+        while fitting and best is None:
+            best = _lighter(task, _preferred(task, fitting), depth, rejected)
+            say(f'cost of a cut with {best.name}')
+            best = with_blade(task, best)
+            if not task.fits(best):
+                rejected.append(unfit(task, best))
+                cutting = {best.integrator: best.cutting}
+                found = [replace(c, cutting=cutting.get(c.integrator, c.cutting)) for c in found]
+                fitting, best = [c for c in fitting if c.integrator not in cutting], None
+        tried += found
         best = best or _near_the_tool(task, found, probing, depth, rejected, say)
         if best is not None:
             rejected += [dearer(c, best) for c in fitting if c.name != best.name]
@@ -201,9 +211,17 @@ def _near_the_tool(
 ) -> Candidate | None:
     """Return the cheapest of the too expensive methods with a far field, if that is in time."""
     dear = [c for c in found if c.errors.total <= task.budget.error and not task.in_time(c)]
-    cheapest = min(dear, key=lambda c: task.worst(c).frame, default=None)
+    cheapest = min(dear, key=task.dearest, default=None)
     if cheapest is None or task.worst(cheapest).substeps > task.stepping.max_substeps:
         return None
-    part, others = far_field(task, cheapest, probing.strains.indenter, depth, say)
+    whole = replace(cheapest, cutting=0.0)
+    part, others = far_field(task, whole, probing.strains.indenter, depth, say)
     rejected += others
-    return part
+    if part is None:
+        return None
+    say(f'cost of a cut with {part.name}')
+    part = with_blade(task, part)
+    if task.fits(part):
+        return part
+    rejected.append(unfit(task, part))
+    return None

@@ -61,6 +61,11 @@ def unfit(task: Task, candidate: Candidate) -> Rejection:
             candidate.name,
             f'{percent(errors.total)}, {by_step}{by_region}; {ms(cost.frame)} a frame',
         )
+    if candidate.cutting > max(task.available, cost.frame):
+        return Rejection(
+            candidate.name,
+            f'{ms(candidate.cutting)} a frame while a blade is drawn, of {ms(task.available)}',
+        )
     if cost.frame > task.available:
         return Rejection(
             candidate.name,
@@ -115,18 +120,19 @@ def _for_accuracy(b: Budget, probing: Probing) -> list[str]:
 
 
 def _for_speed(task: Task, tried: list[Candidate]) -> list[str]:
-    cheap = min(tried, key=lambda c: task.worst(c).frame, default=None)
+    cheap = min(tried, key=task.dearest, default=None)
     if cheap is None:
         return []
     said = []
-    need = task.worst(cheap).frame
+    need = task.dearest(cheap)
     cores = need * task.stepping.rate
     if task.budget.cores < cores <= 1:
         said.append(f'give the simulation {math.ceil(100 * cores) / 100:g} cores: {cheap.name}')
     coarser = (need / task.available) ** 0.25
     if coarser > 1:
         said.append(f'a mesh with edges {coarser:.2f} times longer: {cheap.name}')
-    if task.worst(cheap) != cheap.cost and need > task.available >= cheap.cost.frame:
+    dear = task.worst(cheap).frame > task.available >= max(cheap.cost.frame, cheap.cutting)
+    if task.worst(cheap) != cheap.cost and dear:
         fits = task.available / max(cheap.cost.frame, 1e-12)
         said.append(f'a frequency_growth of {math.floor(10 * fits) / 10:.1f}: {cheap.name}')
     if task.worst(cheap).substeps > task.stepping.max_substeps:
