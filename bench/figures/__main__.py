@@ -98,7 +98,7 @@ SUBJECTS = {
             3: 'it needs eyes that have not seen the code',
             4: 'it needs a browser',
             5: 'it needs a browser',
-            6: 'of it: a crash in an attempt, tested by hand alone',
+            6: 'of it: a crash in an attempt: `./trainer test --all -k test_attempt_crash`',
         },
     ),
     'trust': Subject(
