@@ -18,7 +18,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     ToolSettings,
 )
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
+from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE, BladeConstants
 
 NONE, TOUCHING, INSIDE = range(3)
 """Contact states, as in `Contact`."""
@@ -31,6 +31,9 @@ _PASSIVITY_RECOVERY_S = 0.02
 
 _UNKNOWN_TISSUE_SHARE = 0.1
 """Largest share of the device's force for a tissue of unknown stiffness."""
+
+_MAX_DEEPER = 2.0
+"""Factor by which the blade may be longer in the tissue than at the newest sample."""
 
 MAX_SLEW_PERIOD_S = 0.005
 """[s] Longest period that the slew limit allows for: a late tick catches up no further."""
@@ -56,6 +59,7 @@ SETUP = record_type(
         ('max_slew', 'f8'),  # [N/s]
         ('length', 'f8'),  # [m] of the blade, in the tissue
         ('steps', 'f8', (2,)),  # of a crack [m], 0: none, and friction on the blade [N/m]
+        ('entry_force', 'f8'),  # [N] that lets the blade in; inf: another rule does
         ('hand_length', 'f8'),  # [m] the same at the hand; 0: the device renders no torque
         ('max_torque', 'f8'),  # [N m]
         ('body_frame', 'i8'),
@@ -82,6 +86,10 @@ STATE = record_type(
         ('reach', 'f8'),  # share of the resistance that a blade so far from the surface may feel
         ('edge', 'f8', (2, 3)),  # [m] the blade of the last tick
         ('grips', 'f8'),  # 1: what holds the tissue are jaws, not a blade
+        ('enters', 'b1'),  # whether the tool may go into the tissue
+        ('entered', 'i8'),  # [ns] pose by which it has, before the tissue says so; 0: it has not
+        ('borne', 'f8'),  # [N] that this contact bore although the blade was to go in
+        ('out', 'f8'),  # share of the length in the tissue that has left it since the newest sample
         ('advanced', 'f8', (3,)),  # [m] the edge by steps of a crack since the newest sample
         ('stick', friction.STICK, (1,)),
         ('energy', 'f8'),  # [J] of the passivity observer
@@ -98,7 +106,7 @@ def make_setup(
     device: DeviceSettings,
     haptics: HapticsSettings,
     profile: DeviceProfile,
-    steps: Steps = NO_STEPS,
+    constants: BladeConstants = UNKNOWN_BLADE,
     indexing: Indexing | None = None,
 ) -> np.ndarray:
     """Return the constants of a session for the kernels: dtype SETUP, shape (1,).
@@ -106,7 +114,7 @@ def make_setup(
     Args:
         tool, device, haptics: sections of the scene.
         profile: limits of the device.
-        steps: in which a crack runs before the blade.
+        constants: of the blade in this tissue.
         indexing: how the hand moves the tool, with the scale of `device`; None: as the scene says.
     """
     frame = device.tissue_from_device
@@ -131,7 +139,8 @@ def make_setup(
     length = math.dist(tool.blade_root, tool.blade_tip)
     setup['length'], setup['max_torque'] = length, profile.max_torque
     setup['hand_length'] = length / frame.scale if profile.max_torque > 0.0 else 0.0
-    setup['steps'] = steps
+    setup['steps'] = constants.crack_length, constants.friction
+    setup['entry_force'] = constants.entry_force
     setup['body_frame'] = device.force_frame == 'body'
     return setup
 
@@ -265,8 +274,8 @@ def _tissue_force(
     if h.count > 0 and not (c.one_force and contact == TOUCHING):
         depth = s.proxy - s.tip
         touching = contact == TOUCHING
-        if c.steps[0] > 0.0 and c.law == extrapolation.LOCAL_STIFFNESS and not touching:
-            _run_in_steps(setup, state, history, time, out, torque)
+        if c.law == extrapolation.LOCAL_STIFFNESS and not touching:
+            _pull_blade(setup, state, history, time, out, torque)
         else:
             extrapolation.estimate(
                 c.law, history, time, s.tip, depth, touching, s.arms, c.max_stiffness, out, torque
@@ -284,14 +293,30 @@ def _tissue_force(
         safety.clamp(s.known * safety.norm(s.proxy - s.tip) + c.slack, out)
         if s.stick[0].sliding_friction > 0.0:
             _add_friction(setup, state, history, out)
+        _enter(setup, state, time, out)
     else:
         # The blade transmits at most the cutting resistance: zero while no part is in tissue.
         # It may exceed the last bound only by the stretch of its spring since then.
-        safety.clamp(min(s.reach * s.resistance, s.held), out)
-        safety.clamp(min(s.reach * s.torque_resistance, s.held * c.length), torque)
+        share = s.reach * min(1.0 - s.out, _MAX_DEEPER)
+        safety.clamp(min(share * s.resistance, s.held), out)
+        safety.clamp(min(share * s.torque_resistance, s.held * c.length), torque)
         torque[0] += s.arms[1, 1] * out[2] - s.arms[1, 2] * out[1]
         torque[1] += s.arms[1, 2] * out[0] - s.arms[1, 0] * out[2]
         torque[2] += s.arms[1, 0] * out[1] - s.arms[1, 1] * out[0]
+
+
+@inner
+def _enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> None:
+    """Let the force end in the tick in which it lets the blade in: a sample that says so comes a
+    frame later.
+    """
+    c, s = setup[0], state[0]
+    if not s.enters:
+        return
+    if s.entered == 0 and safety.norm(out) >= max(c.entry_force, s.borne):
+        s.entered = time
+    if s.entered != 0:
+        out[:] = 0.0
 
 
 @inner
@@ -310,7 +335,7 @@ def _hold(setup: np.ndarray, state: np.ndarray, history: np.ndarray, out: np.nda
 
 
 @inner
-def _run_in_steps(
+def _pull_blade(
     setup: np.ndarray,
     state: np.ndarray,
     history: np.ndarray,
@@ -318,18 +343,33 @@ def _run_in_steps(
     out: np.ndarray,
     torque: np.ndarray,
 ) -> None:
-    """Compute force and torque of a blade before which a crack runs in steps.
+    """Compute force and torque of a blade by the stiffness at its newest sample.
 
-    A sample has the steps up to its own time. Since then, the edge goes on here.
+    Along itself the blade slips through the tissue, and what has left it feels nothing: the force
+    is in proportion to the length that is still in it. Where a crack runs in steps, a sample has
+    those up to its own time; since then, the edge goes on here.
     """
-    c, s = setup[0], state[0]
-    arms, most, none = s.arms, c.max_stiffness, np.zeros(3)
+    c, s, h = setup[0], state[0], history[0]
+    arms, most, none, at = s.arms, c.max_stiffness, np.zeros(3), np.empty(3)
+    axis, slip = np.empty(3), 0.0
+    for k in range(3):
+        axis[k] = (arms[0, k] - arms[1, k]) / c.length
+        slip += axis[k] * (s.tip[k] + arms[1, k] - h.position[1, k] - h.arms[1, k])
+    before = 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
+    s.out = min(slip / before, 1.0) if before > 0.0 else 0.0
     for _ in range(2):
-        at = s.tip - s.advanced
+        for k in range(3):
+            at[k] = s.tip[k] - slip * axis[k] - s.advanced[k]
         extrapolation.estimate(c.law, history, time, at, none, False, arms, most, out, torque)
         limit = s.resistance
-        if not extrapolation.step_ahead(out, history, limit, c.steps, c.length, most, s.advanced):
-            return
+        if c.steps[0] == 0.0 or not extrapolation.step_ahead(
+            out, history, limit, c.steps, c.length, most, s.advanced
+        ):
+            break
+    left = min(1.0 - s.out, 1.0)
+    for k in range(3):
+        out[k] *= left
+        torque[k] *= left
 
 
 @inner

@@ -32,13 +32,17 @@ from cutting_trainer.haptic_bridge.tissue_sample import TissueSample
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
 from cutting_trainer.node_common.rejections import MessageError, RejectionStatistics
-from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
+from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE, BladeConstants
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import MAX_PULL_N, ToolMode
 
 _SECOND = 1e-9
 _QUEUE_ALLOWANCE_NS = 3_000_000
 """[ns] of queueing that counts as age of a sample too, so that deadlines hold."""
+_ENTRY_TIMEOUT_NS = 20_000_000
+"""[ns] after which a sample without a blade in the tissue says that it did not go in."""
+_BORNE_RATIO = 1.5
+"""Factor by which the entry force is exceeded before the same contact lets the blade in again."""
 _MAX_PENDING_CONTACTS = 4096
 """Contacts whose answer may still arrive."""
 ENERGY_CREDIT_J = 2e-4
@@ -65,7 +69,7 @@ class ForcePath:
         refusals: rejection statistics to count in; None: its own.
         edge_resistance: largest cutting resistance of the tissue by blade length [N/m].
         friction: of the tool on the tissue.
-        steps: in which a crack runs before the blade.
+        constants: of the blade in this tissue.
         number: of the tool, by its place in the list of the scene.
 
     Attributes:
@@ -90,7 +94,7 @@ class ForcePath:
         rejections: RejectionStatistics | None = None,
         edge_resistance: float = math.inf,
         friction: Friction = NO_FRICTION,
-        steps: Steps = NO_STEPS,
+        constants: BladeConstants = UNKNOWN_BLADE,
         number: int = 0,
     ) -> None:
         self.stale_trips = 0
@@ -98,11 +102,11 @@ class ForcePath:
         self.contact_time = 0.0
         self.max_force = 0.0
         self.mode = self.next_mode = ToolMode[tool.mode.upper()]
-        self.coupling = HandCoupling(tool, device, haptics, profile, steps)
+        self.coupling = HandCoupling(tool, device, haptics, profile, constants)
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
         names = ('force', 'wrench', 'tip', 'blade', 'arms')
-        self._s['grips'] = self.mode.is_grasper
+        self._take_mode(self.mode)
         self._force, self._wrench, self._tip, self._blade, self._arms = map(
             self._s.__getitem__, names
         )
@@ -111,7 +115,7 @@ class ForcePath:
         if any(tool.blade_facing):  # spine and flat do not cut: they stretch the coupling
             edge_resistance = max(edge_resistance, tool.coupling_stiffness)
         self._max_resistance = edge_resistance * self._length
-        self._max_resistance += tool.coupling_stiffness * steps.length / 2
+        self._max_resistance += tool.coupling_stiffness * constants.crack_length / 2
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._grips = friction.sliding > 0.0
         self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
@@ -130,6 +134,11 @@ class ForcePath:
         self._past_arms = np.zeros((_MAX_PENDING_CONTACTS, 2, 3))
         self._contact = NONE
         self._was_enabled = self._stale = False
+
+    def _take_mode(self, mode: ToolMode) -> None:
+        self.mode = mode
+        self._s['grips'] = mode.is_grasper
+        self._s['enters'] = mode is ToolMode.SCALPEL
 
     @property
     def haptics(self) -> HapticsSettings:
@@ -219,8 +228,7 @@ class ForcePath:
         gain = self._gain(now_ns, enabled)
         touched = self._touch(now_ns, surface, enabled)
         if self.mode is not self.next_mode and (self._contact != INSIDE or self.mode.is_grasper):
-            self.mode = self.next_mode
-            self._s['grips'] = self.mode.is_grasper
+            self._take_mode(self.next_mode)
         if fault or state is CrtkState.FAULT:
             self._s['force'] = self._s['torque'] = 0.0
         if not force_kernels.finish(
@@ -303,7 +311,8 @@ class ForcePath:
         self._s['torque_resistance'] = min(
             reaction.torque_resistance, self._max_resistance * self._length
         )
-        self._s['advanced'] = 0.0
+        self._s['advanced'] = self._s['out'] = 0.0
+        self._check_entry(reaction)
         if reaction.state == INSIDE:
             held = max(math.hypot(*reaction.force), math.hypot(*reaction.torque) / self._length)
             self._s['held'] = min(self._s['held'], held + float(self.coupling.setup['slack'][0]))
@@ -335,6 +344,14 @@ class ForcePath:
                 self._undented.note_free(now_ns, reaction.revision)
         return ''
 
+    def _check_entry(self, reaction: TissueSample) -> None:
+        """Let the blade be outside where the tissue has had time to let it in, and has not."""
+        entered = int(self._s['entered'])
+        if entered and reaction.state == TOUCHING and reaction.time >= entered + _ENTRY_TIMEOUT_NS:
+            self._s['entered'] = 0
+            entry = float(self.coupling.setup['entry_force'][0])
+            self._s['borne'] = _BORNE_RATIO * max(entry, float(self._s['borne']))
+
     def _accepts_inside(self, now_ns: int, surface: Surface | None) -> bool:
         already = self._contact == INSIDE
         return self._plausibility.accepts(now_ns, surface, self._blade, already=already)
@@ -348,6 +365,7 @@ class ForcePath:
 
     def _leave_contact(self) -> None:
         self._proxy.reset()
+        self._s['entered'] = self._s['borne'] = 0
         self._contact = NONE
         self._left = self._sequence
         extrapolation.clear(self._history)
@@ -377,6 +395,7 @@ class ForcePath:
             if before != INSIDE:
                 self._proxy.reset()
                 self._undented.release()
+                self._s['entered'] = self._s['borne'] = 0
                 before_cut = self.force_norm / self.haptics.force_scale
                 self._s['held'] = before_cut + self.coupling.setup['slack'][0]
             self._contact = INSIDE
@@ -397,6 +416,7 @@ class ForcePath:
         if not touched.touching:
             if before == TOUCHING:
                 self._left = self._sequence
+                self._s['entered'] = self._s['borne'] = 0
             return touched
         self._undented.freeze()
         self._plausibility.note_touch(now_ns)

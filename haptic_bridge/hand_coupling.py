@@ -20,7 +20,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     ToolSettings,
     check_together,
 )
-from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
+from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE, BladeConstants
 
 _MAX_UNSENT = 1000
 
@@ -45,7 +45,7 @@ class HandCoupling:
     Args:
         tool, device, haptics: sections of the scene.
         profile: limits of the device.
-        steps: in which a crack runs before the blade.
+        constants: of the blade in this tissue.
 
     Attributes:
         setup: constants of the kernels, dtype `force_kernels.SETUP`, shape (1,).
@@ -62,10 +62,11 @@ class HandCoupling:
         device: DeviceSettings,
         haptics: HapticsSettings,
         profile: DeviceProfile,
-        steps: Steps = NO_STEPS,
+        constants: BladeConstants = UNKNOWN_BLADE,
     ) -> None:
         check_together(tool, device, haptics, profile)
-        self._tool, self._device, self._profile, self._steps = tool, device, profile, steps
+        self._tool, self._device, self._profile = tool, device, profile
+        self._constants = constants
         self.indexing = Indexing.of(device.tissue_from_device)
         self.unsent: deque[Indexing] = deque(maxlen=_MAX_UNSENT)
         self._order = self._done = Order(self.indexing.scale, haptics)
@@ -159,7 +160,7 @@ class HandCoupling:
         order = self._done
         device = scaled(self._device, order.motion_scale)
         self.setup = force_kernels.make_setup(
-            self._tool, device, order.haptics, self._profile, self._steps, self.indexing
+            self._tool, device, order.haptics, self._profile, self._constants, self.indexing
         )
 
 

@@ -54,7 +54,7 @@ from cutting_trainer.node_common.realtime import prepare, run_real_time
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
-from cutting_trainer.tissue_sim.contact.crack import NO_STEPS, Steps
+from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE, BladeConstants
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
@@ -117,7 +117,7 @@ class HapticBridge(ManagedNode):
         felt = parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
         text, scale = 'tool motion over hand motion [-], above 0 to 100', device.tissue_from_device
         device = scaled(device, parameter(self, 'motion_scale', scale.scale, text, settable=True))
-        resistance, friction, steps = of_tissue(scene)
+        resistance, friction, constants = of_tissue(scene)
         warm_up(tool, device, haptics, profile, friction)
         self._path = ForcePath(
             tool,
@@ -127,7 +127,7 @@ class HapticBridge(ManagedNode):
             self.rejections,
             resistance,
             friction,
-            steps,
+            constants,
             names.index(name),
         )
         self._path.coupling.change(force_scale=felt)
@@ -412,18 +412,18 @@ def scales_of(parameters: list[Parameter]) -> dict[str, Any]:
     return {given.name: given.value for given in parameters if given.name in SCALES}
 
 
-def of_tissue(scene: Path) -> tuple[float, Friction, Steps]:
+def of_tissue(scene: Path) -> tuple[float, Friction, BladeConstants]:
     """Return the largest cutting resistance of the tissue by blade length [N/m], inf if it is
-    unknown, its friction, and the steps in which it is cut.
+    unknown, its friction, and the constants of a blade in it.
     """
     try:
         tissue = read_section(scene, 'tissue', TissueSettings)
     except SceneError:  # a scene for the device alone, or one that tissue_sim rejects
-        return math.inf, NO_FRICTION, NO_STEPS
+        return math.inf, NO_FRICTION, UNKNOWN_BLADE
     m, of = tissue.material, tissue.region_values
     pairs = zip(of('toughness'), of('blade_friction'), strict=True)
     most = max(sum(pair) for pair in [(m.toughness, m.blade_friction), *pairs])
-    return most, m.dry_friction, tissue.steps
+    return most, m.dry_friction, tissue.blade_constants
 
 
 def main() -> None:

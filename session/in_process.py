@@ -258,7 +258,7 @@ def make_force_path(scene: Scene) -> ForcePath:
         scene.haptics,
         scene.profile,
         friction=scene.tissue.material.dry_friction,
-        steps=scene.tissue.steps,
+        constants=scene.tissue.blade_constants,
     )
 
 

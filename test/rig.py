@@ -13,6 +13,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
 )
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec, StampedMessage
 from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE
 
 MS = 1_000_000
 FRAME = 33
@@ -26,9 +27,12 @@ UNIT = (0.0, 0.0, 0.0, 1.0)
 class Rig:
     """A force path between a device at some height and a tissue that is a spring along z."""
 
-    def __init__(self, *, haptics=QUIET, device=None, tool=None, profile=PROFILE):
+    def __init__(
+        self, *, haptics=QUIET, device=None, tool=None, profile=PROFILE, constants=UNKNOWN_BLADE
+    ):
         self.tool = tool or ToolSettings(radius=RADIUS, coupling_stiffness=200.0)
-        self.path = ForcePath(self.tool, device or DeviceSettings(), haptics, profile)
+        device = device or DeviceSettings()
+        self.path = ForcePath(self.tool, device, haptics, profile, constants=constants)
         self.now, self.ms, self.step = 10**12, 0, 0
         self.state = CrtkState.ENABLED
         self.surface = flat_surface(revision=0)

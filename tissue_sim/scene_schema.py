@@ -1,5 +1,6 @@
 """Section `tissue` of a scene file."""
 
+import math
 from collections.abc import Container
 from typing import Annotated, Any, Literal, Self
 
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
 from cutting_trainer.node_common.scene_reader import SceneModel, ScenePath
-from cutting_trainer.tissue_sim.contact.crack import Steps
+from cutting_trainer.tissue_sim.contact.blade_constants import BladeConstants
 from cutting_trainer.tissue_sim.contact.friction import Friction
 from cutting_trainer.tissue_sim.contact.tool_spring import ContactName
 from cutting_trainer.tissue_sim.elasticity.models import ModelName
@@ -380,11 +381,12 @@ class TissueSettings(SceneModel):
         return [common if value is None else value for value in given]
 
     @property
-    def steps(self) -> Steps:
-        """The steps in which a crack runs before the blade."""
-        return Steps(
+    def blade_constants(self) -> BladeConstants:
+        """The constants of the blade's law that the force loop knows."""
+        return BladeConstants(
             self.material.crack_length,
             max(self.material.blade_friction, *self.region_values('blade_friction'), 0.0),
+            math.inf if self.tip_width else self.cut_threshold,
         )
 
     @model_validator(mode='after')

@@ -22,6 +22,7 @@ from cutting_trainer.session.in_process import TICK_S, InProcess, LinkSettings, 
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import load_tissue
 from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -144,11 +145,11 @@ class Bench:
         part = part**3 * (10 - 15 * part + 6 * part * part)
         height, along = motion.path(np.maximum(t - APPROACH_TIME_S, 0.0))
         height = (1 - part) * 0.002 + part * height
-        top = self._touch(place)
+        top = self.touch_height(place)
         x, y = place
         return np.column_stack([x + along, np.full_like(t, y), top + height])
 
-    def _touch(self, place: tuple[float, float]) -> float:
+    def touch_height(self, place: tuple[float, float]) -> float:
         """Return height at which a tip that comes down first touches [m]."""
         simulation = self.tissue(FRAME_RATE_HZ, cuts=False).simulation
         surface = _surface(simulation, None)
@@ -194,6 +195,7 @@ class Bench:
                     radius=tool.radius,
                     blade_root=tip + tool.blade_root,
                     blade_tip=tip + tool.blade_tip,
+                    blade_facing=tool.facing(),
                 )
             )
             forces[i], state = frame.force, frame.state
@@ -205,7 +207,8 @@ class Bench:
         """Return forces that the force path commands over a tissue at 30 Hz [N], shape (k, 3)."""
         scene = self.scene
         settings = scene.haptics.model_copy(update={'soft_start': 0.0, **haptics})
-        force_path = ForcePath(scene.tool, scene.device, settings, scene.profile)
+        known = scene.tissue.blade_constants if cuts else UNKNOWN_BLADE
+        force_path = ForcePath(scene.tool, scene.device, settings, scene.profile, constants=known)
         session = InProcess(force_path, self.tissue(FRAME_RATE_HZ, cuts), FRAME_RATE_HZ, link)
         frame = scene.device.tissue_from_device
         forces = np.zeros_like(path)

@@ -14,7 +14,7 @@ from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
 from cutting_trainer.session.in_process import InProcess, Tissue
 from cutting_trainer.tissue_sim.contact.blade import Resistance
-from cutting_trainer.tissue_sim.contact.crack import Steps
+from cutting_trainer.tissue_sim.contact.blade_constants import BladeConstants
 
 SIZE = (0.048, 0.024, 0.012)
 """Block, to half a cell [m]."""
@@ -121,7 +121,7 @@ def felt_by_hand(cell: float, crack: float = CRACK) -> tuple[Teeth, float]:
     resistance = Resistance(0.02, SLICED, 0.0, crack_length=crack)
     simulation = block('stiffening', resistance, FIRM, cell, 30.0, SIZE)
     device, haptics = DeviceSettings(), HapticsSettings(soft_start=0.0, max_damping=0.0)
-    path = ForcePath(TOOL, device, haptics, device.load_profile(), steps=Steps(crack))
+    path = ForcePath(TOOL, device, haptics, device.load_profile(), constants=BladeConstants(crack))
     session = InProcess(path, Tissue(simulation, make_method(CuttingSettings())), 30.0)
     top, lowest = float(simulation.mesh.rest[:, 2].max()), -TOOL.blade_tip[2]
     down = round(1e3 * (DEPTH + 0.002) / ENTRY)

@@ -19,21 +19,6 @@ _STAYS = 1e9
 """Share of its steady resistance that an edge bears which stays where it is."""
 
 
-class Steps(NamedTuple):
-    """Steps in which a crack runs, as the force loop knows them.
-
-    Attributes:
-        length: of a step [m]; 0: the crack runs steadily.
-        friction: of the blade by its length in the tissue [N/m].
-    """
-
-    length: float = 0.0
-    friction: float = 0.0
-
-
-NO_STEPS = Steps()
-
-
 class Tooth(NamedTuple):
     """The next tooth of the force.
 
