@@ -345,9 +345,9 @@ def _pull_blade(
 ) -> None:
     """Compute force and torque of a blade by the stiffness at its newest sample.
 
-    Along itself the blade slips through the tissue, and what has left it feels nothing: the force
-    is in proportion to the length that is still in it. Where a crack runs in steps, a sample has
-    those up to its own time; since then, the edge goes on here.
+    Along itself the blade slips through the tissue, and a part that has left it feels nothing: the
+    force is in proportion to the length that is still in it. Where a crack runs in steps, a sample
+    has those up to its own time; since then, the edge goes on here.
     """
     c, s, h = setup[0], state[0], history[0]
     arms, most, none, at = s.arms, c.max_stiffness, np.zeros(3), np.empty(3)

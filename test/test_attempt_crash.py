@@ -29,7 +29,7 @@ OVER = [0.018, 0.0, 0.030]
 
 
 def trainer(*words: str) -> str:
-    """What a command says on standard output; it has to end in order."""
+    """Return the standard output of a command, which has to end in order."""
     command = [sys.executable, '-m', 'cutting_trainer.cli', *words]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stdout + done.stderr
