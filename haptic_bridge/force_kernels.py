@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge import extrapolation, safety
+from cutting_trainer.haptic_bridge import blade_force, extrapolation, safety
 from cutting_trainer.haptic_bridge.contact_values import pack
 from cutting_trainer.haptic_bridge.devices.motion_gate import judge
 from cutting_trainer.haptic_bridge.indexing import Indexing
@@ -269,13 +269,13 @@ def _tissue_force(
     if contact == NONE:
         return
     if contact == INSIDE and s.grips > 0.0:
-        _hold(setup, state, history, out)
+        blade_force.hold(setup, state, history, out)
         return
     if h.count > 0 and not (c.one_force and contact == TOUCHING):
         depth = s.proxy - s.tip
         touching = contact == TOUCHING
         if c.law == extrapolation.LOCAL_STIFFNESS and not touching:
-            _pull_blade(setup, state, history, time, out, torque)
+            blade_force.pull_blade(setup, state, history, time, out, torque)
         else:
             extrapolation.estimate(
                 c.law, history, time, s.tip, depth, touching, s.arms, c.max_stiffness, out, torque
@@ -293,7 +293,7 @@ def _tissue_force(
         safety.clamp(s.known * safety.norm(s.proxy - s.tip) + c.slack, out)
         if s.stick[0].sliding_friction > 0.0:
             _add_friction(setup, state, history, out)
-        _enter(setup, state, time, out)
+        blade_force.enter(setup, state, time, out)
     else:
         # The blade transmits at most the cutting resistance: zero while no part is in tissue.
         # It may exceed the last bound only by the stretch of its spring since then.
@@ -303,73 +303,6 @@ def _tissue_force(
         torque[0] += s.arms[1, 1] * out[2] - s.arms[1, 2] * out[1]
         torque[1] += s.arms[1, 2] * out[0] - s.arms[1, 0] * out[2]
         torque[2] += s.arms[1, 0] * out[1] - s.arms[1, 1] * out[0]
-
-
-@inner
-def _enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> None:
-    """Let the force end in the tick in which it lets the blade in: a sample that says so comes a
-    frame later.
-    """
-    c, s = setup[0], state[0]
-    if not s.enters:
-        return
-    if s.entered == 0 and safety.norm(out) >= max(c.entry_force, s.borne):
-        s.entered = time
-    if s.entered != 0:
-        out[:] = 0.0
-
-
-@inner
-def _hold(setup: np.ndarray, state: np.ndarray, history: np.ndarray, out: np.ndarray) -> None:
-    """Compute the force of tissue between jaws. They hold a point: a turn changes nothing."""
-    s, h = state[0], history[0]
-    if h.count == 0:
-        return
-    scale = extrapolation.rendered_share(h.stiffness, setup[0].max_stiffness)
-    for k in range(3):
-        pull = 0.0
-        for j in range(3):
-            pull += h.stiffness[k, j] * (s.tip[j] - h.position[1, j])
-        out[k] = h.force[1, k] - scale * pull
-    safety.clamp(min(s.resistance, s.held), out)
-
-
-@inner
-def _pull_blade(
-    setup: np.ndarray,
-    state: np.ndarray,
-    history: np.ndarray,
-    time: int,
-    out: np.ndarray,
-    torque: np.ndarray,
-) -> None:
-    """Compute force and torque of a blade by the stiffness at its newest sample.
-
-    Along itself the blade slips through the tissue, and a part that has left it feels nothing: the
-    force is in proportion to the length that is still in it. Where a crack runs in steps, a sample
-    has those up to its own time; since then, the edge goes on here.
-    """
-    c, s, h = setup[0], state[0], history[0]
-    arms, most, none, at = s.arms, c.max_stiffness, np.zeros(3), np.empty(3)
-    axis, slip = np.empty(3), 0.0
-    for k in range(3):
-        axis[k] = (arms[0, k] - arms[1, k]) / c.length
-        slip += axis[k] * (s.tip[k] + arms[1, k] - h.position[1, k] - h.arms[1, k])
-    before = 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
-    s.out = min(slip / before, 1.0) if before > 0.0 else 0.0
-    for _ in range(2):
-        for k in range(3):
-            at[k] = s.tip[k] - slip * axis[k] - s.advanced[k]
-        extrapolation.estimate(c.law, history, time, at, none, False, arms, most, out, torque)
-        limit = s.resistance
-        if c.steps[0] == 0.0 or not extrapolation.step_ahead(
-            out, history, limit, c.steps, c.length, most, s.advanced
-        ):
-            break
-    left = min(1.0 - s.out, 1.0)
-    for k in range(3):
-        out[k] *= left
-        torque[k] *= left
 
 
 @inner
