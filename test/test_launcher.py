@@ -434,7 +434,7 @@ def test_change_of_a_kernel_recompiles_what_imports_it_and_nothing_else(
     texts = {
         'base': used,
         'middle': f'{used}from cutting_trainer.cutting.base import f\n',
-        'top': f'{used}from cutting_trainer.cutting.middle import g\n',
+        'top': f'{used}from cutting_trainer.cutting import (\n    beside,\n    middle,\n)\n',
         'beside': used,
     }
     for name, text in texts.items():
