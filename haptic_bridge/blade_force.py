@@ -8,8 +8,11 @@ from cutting_trainer.node_common.kernels import inner
 
 @inner
 def enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> None:
-    """Let the force end in the tick in which it lets the blade in: a sample that says so comes a
+    """Let the force fall in the tick in which it lets the blade in: a sample that says so comes a
     frame later.
+
+    Friction is left, on the length of the blade below the undented surface: the tissue springs back
+    to there.
     """
     c, s = setup[0], state[0]
     if not s.enters:
@@ -17,7 +20,7 @@ def enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> N
     if s.entered == 0 and safety.norm(out) >= max(c.entry_force, s.borne):
         s.entered = time
     if s.entered != 0:
-        out[:] = 0.0
+        safety.clamp(c.steps[1] * safety.norm(s.proxy - s.tip), out)
 
 
 @inner
