@@ -67,8 +67,9 @@ class Scheme:
         subdivides: elements are divided.
         least_share: smallest distance of new nodes from the ends of an edge, as a share of the
             edge.
-        reach: how much further than the tip the blade is taken to cut, as a share of the median
-            altitude at the start: by so much the front ends short of it in the mean.
+        reach: how much further than the tip the blade is taken to cut, and
+        lead: how far the cut is led on where a stroke begins or ends inside the tissue, as a share
+            of the median altitude at the start; its front slides back. 0: strokes are not joined.
     """
 
     tau: float = 0.33
@@ -81,6 +82,7 @@ class Scheme:
     subdivides: bool = True
     least_share: float = 0.1
     reach: float = 0.0
+    lead: float = 0.0
 
 
 class Batch(NamedTuple):

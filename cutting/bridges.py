@@ -21,6 +21,7 @@ from cutting_trainer.cutting.parting import (
 )
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 Mask = NDArray[np.bool_]
 
@@ -61,7 +62,7 @@ def part_bridges(
     if not len(surface.points):
         return delta, area, places
     nodes = tables.node_id[: tables.counts[NODES]]
-    for attempt in range(1 + _TRIES):
+    for attempt in range(2 + _TRIES):
         local = local_elements(mesh, delta, nodes, lines[0], np.inf, 1)
         plus, minus = _sides(local, tables, first_new)
         height = judged_heights(local, surface, np.ones(len(plus), bool), h)
@@ -69,8 +70,12 @@ def part_bridges(
         plus, minus = plus & (height > _CLEAR * h), minus & (height < -_CLEAR * h)
         faces = least_faces(local, surface, np.abs(height) < _TUBE * h, plus, minus, h)
         places = centres_of(local)[faces // 4]
-        if not len(faces) or attempt == _TRIES:
+        if not len(faces) or attempt == 1 + _TRIES:
             break
+        if attempt == 0:  # once more, with all elements around the nodes of these faces
+            ends = local.nodes[local.corners[faces[:, None] // 4, FACE_NODES[faces % 4]]]
+            nodes = np.union1d(nodes, ends[ends < mesh.node_count])
+            continue
         delta, more = open_faces(mesh, delta, local, faces)
         area += more
     return delta, area, places

@@ -14,6 +14,8 @@ from cutting_trainer.cutting.geometry import smallest_altitudes
 from cutting_trainer.cutting.junctions import part_junctions
 from cutting_trainer.cutting.lookup import NODES, clear, empty_tables, with_room
 from cutting_trainer.cutting.method_interface import CutResult, check_sweep
+from cutting_trainer.cutting.notches import open_notches
+from cutting_trainer.cutting.rest_path import map_to_rest
 from cutting_trainer.cutting.snap_release import settle_waiting
 from cutting_trainer.cutting.snapping import SnapLimits, SnapStroke, conflicts, register
 from cutting_trainer.cutting.state_table import active_list, pending
@@ -103,11 +105,12 @@ class CombinedMethod:
         touched = 0
         folded = False
         while self._queue and not folded:
+            before = self._active
             met, folded = self._meet(mesh, positions, self._queue[0], tolerant=finish)
             touched += met
             if not folded:
                 self._last = self._queue.pop(0)
-                self._trace(mesh, positions)
+                self._trace(mesh, positions, before)
         if finish or folded:
             self._round_off(mesh, positions)
         active = self._active[:0] if finish or folded else self._active
@@ -124,8 +127,9 @@ class CombinedMethod:
             area += more
             warnings += said
             self._empty_tables(mesh, delta.node_parents.shape[0])
-        further = len(delta.node_parents) - len(batch.delta.node_parents)
-        self._size = (batch.size[0] + further, batch.size[1])
+        nodes = len(delta.node_parents) - len(batch.delta.node_parents)
+        divided = len(delta.tetrahedra) - len(delta.removed_tetrahedra)
+        self._size = (batch.size[0] + nodes, len(mesh.tetrahedra) + divided)
         report = replace(
             batch.report,
             touched=touched,
@@ -134,25 +138,33 @@ class CombinedMethod:
         )
         return CutResult(delta, report)
 
-    def _trace(self, mesh: TetMesh, positions: np.ndarray) -> None:
-        """Remember where the blade went, in the rest shape of the elements around it."""
-        if not len(self._active):
+    def _trace(self, mesh: TetMesh, positions: np.ndarray, left: np.ndarray) -> None:
+        """Remember where the blade went, in the rest shape of the elements around it.
+
+        Args:
+            mesh: the tissue.
+            positions: of its nodes [m], shape (n, 3).
+            left: nodes of the elements around the blade before the sweep, shape (a, 4).
+        """
+        leaves = not len(self._active)
+        around = left if leaves else self._active
+        if not len(around) or leaves:
             return
-        nodes = np.unique(self._active)
-        near = np.column_stack([positions[nodes], np.ones(len(nodes))])
-        to_rest = np.linalg.lstsq(near, mesh.rest[nodes], rcond=None)[0]
-        corners = np.column_stack([self._last, np.ones(4)]) @ to_rest
+        to_rest = map_to_rest(self._last[2], self._last[3], positions, mesh.rest, around)
+        corners = self._last @ to_rest[:3] + to_rest[3]
         here, rest = (
             np.linalg.norm(at[[0, 3]] - at[[1, 2]], axis=1) for at in (self._last, corners)
         )
         if (rest > _MAX_STRETCH * here).any():
             return  # the map of few flat elements says nothing of an edge that is long beside them
         edge = corners[[3, 2]]
-        if not len(self._lines):
-            self._lines = corners[None, :2]
-        way = np.linalg.norm(edge - self._lines[-1], axis=1).mean()
-        if way > 0.2 * _EDGE * self._altitude:
-            self._lines = np.concatenate([self._lines, edge[None]])
+        if leaves:  # on from where it was last
+            edge = edge + self._lines[-1] - corners[:2]
+        kept = self._lines if len(self._lines) else corners[None, :2]
+        # The last one is taken back if the blade had hardly moved on.
+        if len(kept) > 1 and _mean_way(kept[-2:]) < 0.2 * _EDGE * self._altitude:
+            kept = kept[:-1]
+        self._lines = np.concatenate([kept, edge[None]])
 
     def _join_strokes(
         self, mesh: TetMesh, delta: TopologyDelta, *, folded: bool
@@ -162,7 +174,7 @@ class CombinedMethod:
         """
         h = _EDGE * self._altitude
         lines, self._lines = self._lines, self._lines[:0]
-        if not self._scheme.reach or len(lines) < 2:
+        if not self._scheme.lead or len(lines) < 2:
             return delta, 0.0, []
         delta, area, places = part_bridges(mesh, delta, self._tables, self._first_new, lines, h)
         ends = []
@@ -172,8 +184,9 @@ class CombinedMethod:
         nodes = self._tables.node_id[: self._tables.counts[NODES]]
         delta, more = part_junctions(mesh, delta, nodes, ends, self._strips, h)
         self._strips = [*self._strips, *ends][-_MAX_STRIPS:]
-        area += more
         small = self._limits().small
+        delta, notched = open_notches(mesh, delta, self._tables, self._first_new, lines, h, small)
+        area += more + notched
         delta, more, opened = slide_front(mesh, delta, nodes, self._first_new, lines, h, small)
         said = [_HOLDS.format(*1e3 * place) for place in places[:1]]
         closed, middle = closed_area(mesh, lines, opened, h)
@@ -182,13 +195,13 @@ class CombinedMethod:
         return delta, area + more, said
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
-        """Lead the cut on by the reach, where a stroke ends inside the tissue."""
-        reach = self._scheme.reach * self._altitude
+        """Lead the cut on, where a stroke ends inside the tissue."""
+        lead = self._scheme.lead * self._altitude
         way = (self._last[2:] - self._last[1::-1]).mean(axis=0)
         length = float(np.linalg.norm(way))
-        if len(self._active) and min(reach, length) > 0.0:
+        if len(self._active) and min(lead, length) > 0.0:
             end = self._last[[3, 2, 2, 3]]
-            end[2:] += way * (reach / length)
+            end[2:] += way * (lead / length)
             self._meet(mesh, positions, end, tolerant=True)
         self._last = np.zeros((4, 3))
 
@@ -225,8 +238,7 @@ class CombinedMethod:
         links, tables = mesh.links, self._tables
         self._mark += 1
         self._seen = grown(self._seen, len(tables.owner))
-        # The mesh cuts short of the blade's ends by this much, in the mean.
-        reach = self._scheme.reach * self._altitude
+        reach, lead = (share * self._altitude for share in (self._scheme.reach, self._scheme.lead))
         triangles = surfaces(lengthened(corners, reach, reach, back=0.0))
         met = met_tetrahedra(
             triangles, links, positions, near, not self._located, self._seen, self._mark
@@ -236,7 +248,7 @@ class CombinedMethod:
         begins = not tables.counts[NODES]
         if begins or not (len(self._active) and len(active)):
             before, after = reach * (len(self._active) > 0), reach * (len(active) > 0)
-            back = before if begins else 0.0
+            back = lead if begins and before > 0.0 else 0.0
             triangles = surfaces(lengthened(corners, before, after, back=back))
         nodes, data = find_hits(triangles, links, tables, positions, met)
         self._turn(triangles, corners)
@@ -290,3 +302,8 @@ class CombinedMethod:
         if pending(self._tables):
             raise CutStateError('crossings are pending after a stroke; they have to be in the mesh')
         clear(self._tables, self._first_new, mesh.node_count + new_nodes)
+
+
+def _mean_way(edges: np.ndarray) -> float:
+    """Return the way from an edge to the next, mean of root and tip [m]; shape (2, 2, 3)."""
+    return float(np.linalg.norm(edges[1] - edges[0], axis=1).mean())

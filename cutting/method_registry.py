@@ -6,9 +6,9 @@ from cutting_trainer.cutting.delete import DeleteMethod
 from cutting_trainer.cutting.method_interface import CutMethod
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 
-_REACH = 0.44
-"""Of `combined`: without it, straight cuts through well-shaped elements lack 0.3 edges of depth, at
-any depth."""
+_REACH, _LEAD = 0.1, 0.44
+"""Of `combined`: its front slides back at the end of a stroke. Shorter ones leave more of shallow
+cuts and of short strokes closed."""
 
 
 def make_method(settings: CuttingSettings) -> CutMethod:
@@ -16,7 +16,8 @@ def make_method(settings: CuttingSettings) -> CutMethod:
     floor = settings.altitude_floor
     match settings.method:
         case 'combined':
-            return CombinedMethod(Scheme(tau=settings.tau or 0.33, floor=floor, reach=_REACH))
+            tau = settings.tau or 0.33
+            return CombinedMethod(Scheme(tau=tau, floor=floor, reach=_REACH, lead=_LEAD))
         case 'combined_midpoint':
             tau = settings.tau or 0.25
             return CombinedMethod(Scheme(tau=tau, floor=floor, true_points=False, slides=False))

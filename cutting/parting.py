@@ -176,7 +176,7 @@ def _gather(links, rest, seeds, removed, line, region, rings):
 
 
 @kernel
-def _match(corners, count):
+def match_faces(corners, count):
     """Return the face behind each face, or -1, shape (k, 4).
 
     Args:
@@ -226,7 +226,7 @@ def local_elements(
     rest[first_new:] = interpolated(mesh.rest, delta.node_parents[new], delta.node_weights[new])
     _, at, here = np.intersect1d(nodes, delta.moved_nodes, return_indices=True)
     rest[at] = interpolated(mesh.rest, delta.moved_parents[here], delta.moved_weights[here])
-    return Local(nodes, rest, corners, number, _match(corners, len(nodes)))
+    return Local(nodes, rest, corners, number, match_faces(corners, len(nodes)))
 
 
 def part_along(
@@ -409,7 +409,7 @@ def _flood(start, number, node, across, corners, volumes, part):
 
 
 @kernel
-def _whole(nodes, corners, number, links, removed):
+def whole_nodes(nodes, corners, number, links, removed):
     """Return which nodes have all their elements at hand, shape (j,)."""
     missing = np.zeros(len(nodes), np.int64)
     for e in range(len(corners)):
@@ -451,7 +451,7 @@ def open_faces(
     corners = local.corners.copy()
     volumes = _volumes(local.rest, local.corners)
     removed = np.ascontiguousarray(delta.removed_tetrahedra)
-    whole = _whole(local.nodes, local.corners, local.number, mesh.links, removed)
+    whole = whole_nodes(local.nodes, local.corners, local.number, mesh.links, removed)
     copies = _split(faces, local.across.copy(), corners, volumes, whole)
     if not len(copies):
         return delta, 0.0

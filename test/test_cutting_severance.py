@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from strokes import draw, method_named
 
+from bench.cuts import random_strokes
 from bench.cuts.curves import (
     Cut,
     Organ,
@@ -18,9 +19,11 @@ from bench.cuts.curves import (
 )
 from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free
 from bench.cuts.strokes import good_block
-from cutting_trainer.cutting.combined import FOLDED
+from cutting_trainer.cutting.batch import Scheme
+from cutting_trainer.cutting.combined import FOLDED, CombinedMethod
 from cutting_trainer.cutting.cut_invariants import check_area, check_mesh, cut_face_area
 from cutting_trainer.cutting.parting import local_elements
+from cutting_trainer.cutting.rest_path import map_to_rest
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 
 pytestmark = pytest.mark.long
@@ -154,24 +157,34 @@ def test_a_blade_parallel_to_the_surface_takes_no_volume(depth):
 
 
 @pytest.mark.parametrize(
-    'depth', [2.0, *(pytest.param(d, marks=pytest.mark.thorough) for d in (1.0, 4.0))]
+    'depth', [0.5, *(pytest.param(d, marks=pytest.mark.thorough) for d in (1.0, 2.0, 4.0))]
 )
 def test_the_opened_area_is_the_swept_one(depth):
     """In the mean of some directions: a front follows the elements, now beyond, now short."""
-    nodes, tetrahedra = good_block((8, 8, 6), 0.005, seed=0)
-    block = organ_of('block', nodes, tetrahedra)
+    block = organ_of('block', *good_block((8, 8, 6), 0.005, seed=0))
     opened, swept = 0.0, 0.0
-    high = nodes[:, 2].max()
     for angle in np.linspace(0.1, 3.0, 6):
-        along = np.array([np.cos(angle), np.sin(angle), 0.0])
-        way = np.linspace(-0.035, 0.035, 60)[:, None] * along + block.middle
-        path = np.stack([way, way], axis=1)
-        path[:, 0, 2], path[:, 1, 2] = high + 0.003, high - depth * block.h
-        mesh, warnings, error = cut_mesh(block, Cut((path,)))
+        cut, area = straight(block, depth, angle)
+        mesh, warnings, error = cut_mesh(block, cut, check=True)
         assert error == '' and FOLDED not in warnings
         opened += cut_face_area(mesh)
-        swept += depth * block.h * 0.04 / np.abs(along).max()
-    assert opened / swept == pytest.approx(1.0, abs=0.08)
+        swept += area
+    assert opened / swept == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize('length', [1.25, 2.0])
+def test_a_short_stroke_inside_the_tissue_opens_what_it_swept(length):
+    """An edge deep: no more than some elements, in most of which the blade's end has been."""
+    block, ratios = organ_of('block', *good_block((8, 8, 4), 0.005, seed=102)), []
+    for angle in ANGLES:
+        along = length * block.h * np.array([np.cos(angle), np.sin(angle), 0.0])
+        way = block.middle + np.linspace(-0.5, 0.5, 16)[:, None] * along
+        path, high = np.stack([way, way], axis=1), block.nodes[:, 2].max()
+        path[:, 0, 2], path[:, 1, 2] = high + block.h, high - block.h
+        mesh, _, error = cut_mesh(block, Cut((path,)), check=True)
+        assert error == ''
+        ratios.append(cut_face_area(mesh) / (length * block.h**2))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.15)
 
 
 def test_the_same_strokes_cut_the_same_mesh(plate):
@@ -209,19 +222,49 @@ def test_the_front_lies_where_the_end_of_the_blade_went(depth):
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_swept_area_that_stays_closed_is_said_and_nothing_else_is():
-    """A blade half an edge deep may cross no edge inside the tissue: there is no face to open."""
+@pytest.mark.parametrize('depth', [0.2, 0.5, 1.0])
+def test_a_swept_area_that_stays_closed_is_said_and_nothing_else_is(depth):
+    """A blade a fifth of an edge deep opens little: elements there would be too flat."""
     block, closed = organ_of('block', *good_block((8, 8, 6), 0.005, seed=101)), 0
     for angle in ANGLES:
-        for depth in (0.5, 1.0):
-            cut, swept = straight(block, depth, angle)
-            mesh, warnings, _ = cut_mesh(block, cut)
-            share = cut_face_area(mesh) / swept
-            said = any('so shallow' in warning for warning in warnings)
-            assert said or share > 0.6
-            assert not said or share < 0.8
-            closed += said
-    assert closed > 0
+        cut, swept = straight(block, depth, angle)
+        mesh, warnings, _ = cut_mesh(block, cut)
+        share = cut_face_area(mesh) / swept
+        said = any('so shallow' in warning for warning in warnings)
+        # Half a squared edge is not said: most of what so shallow a blade sweeps.
+        assert said or share > 0.6 or depth < 0.5
+        assert not said or share < 0.8
+        closed += said
+    assert (closed > 0) == (depth < 0.5)
+
+
+def test_faces_that_hang_on_at_the_border_of_what_is_looked_at_leave_no_pinch(monkeypatch):
+    """A bridge is parted at nodes all of whose elements are known."""
+    scheme = Scheme(floor=0.02, reach=0.1, lead=0.1)
+    monkeypatch.setattr(random_strokes, 'make_method', lambda settings: CombinedMethod(scheme))
+    rng, strokes = np.random.default_rng(77), 0
+    while strokes < 121:
+        strokes += len(random_strokes.random_scene(rng).strokes)
+    batches, _ = random_strokes.play(random_strokes.random_scene(rng))
+    assert batches > 10
+
+
+def test_the_path_of_a_tip_at_rest_is_exact_in_strained_tissue():
+    """The tissue is bent: the tip lies in one element, and the map of that element is its place."""
+    block = organ_of('block', *good_block((4, 4, 4), 0.005, seed=3))
+    rest = block.nodes
+    x, y, z = (rest / np.ptp(rest, axis=0)).T
+    positions = rest + 0.004 * np.stack([y * z, 0.5 * x * x, -x * y], axis=1)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        element = rng.integers(len(block.tetrahedra))
+        weights = rng.dirichlet(np.ones(4))
+        tip = weights @ positions[block.tetrahedra[element]]
+        root = tip + np.array([0.001, 0.002, 0.03])
+        around = block.tetrahedra[[element, *rng.integers(len(block.tetrahedra), size=6)]]
+        to_rest = map_to_rest(tip, root, positions, rest, around)
+        place = np.append(tip, 1.0) @ to_rest
+        np.testing.assert_allclose(place, weights @ rest[block.tetrahedra[element]], atol=1e-12)
 
 
 def test_ends_of_strokes_that_meet_beside_the_tissue_part_nothing(plate):
