@@ -43,6 +43,14 @@ def presses(*places: tuple[float, float]) -> list[np.ndarray]:
     return [np.array([[x, y, 0.024]]) for x, y in places]
 
 
+def ring(radius: float, height: float, turns: float, count: int = 48) -> np.ndarray:
+    """Places along a circle around the middle, at a height [m]."""
+    angles = 2 * np.pi * np.linspace(0.0, turns, count)
+    return np.column_stack(
+        [radius * np.cos(angles), radius * np.sin(angles), np.full(count, height)]
+    )
+
+
 OPENED, MARKED = 'target that is opened', 'lumps marked'
 EXERCISES = {
     'lumps': Exercise(
@@ -55,6 +63,11 @@ EXERCISES = {
         [line((-0.017, 0, 0.014), (-0.002, 0, 0.014))],
         OPENED,
         notches=4,
+    ),
+    'circle': Exercise(
+        [ring(0.02625, 0.004, 1.05)],
+        [ring(0.02625, 0.004, 0.5)],
+        OPENED,
     ),
 }  # fmt: skip
 
