@@ -101,12 +101,18 @@ def test_progress_of_an_attempt_is_shown_and_the_score_once_the_tip_is_back() ->
     end = moment([0.018, 0, 0.040], 0, 0.0)
     content = progress.see(now + 1, replica, end)
     assert content is not None and content['score'] is None  # the last cut may be under way
+    content = progress.see(now + 1.5, replica, moment(inside, 2, 1.0))  # on in the tissue
+    assert content is not None and content['score'] is None
     replica.step += 6
-    content = progress.see(now + 2, replica, end)
+    content = progress.see(now + 2, replica, moment(inside, 2, 1.0))
+    assert content is not None and content['score'] is None  # it has not ended
+    content = progress.see(now + 2.5, replica, end)
+    replica.step += 6
+    content = progress.see(now + 3, replica, end)
     assert content is not None and content['score']['passed'] is False
     assert any('target that is opened' in reason for reason in content['score']['reasons'])
     replica.step = 0  # a new tissue
-    content = progress.see(now + 3, replica, moment([-0.018, 0, 0.040], 0, 0.0))
+    content = progress.see(now + 4, replica, moment([-0.018, 0, 0.040], 0, 0.0))
     assert content is not None and content['score'] is None
     assert rows(content)['time'] == ('0 s', False)
 

@@ -71,7 +71,9 @@ class AttemptProgress:
             self._topology = replica.topology
             attempt.see_tissue(now, replica)
         measures = attempt.measures()
-        if attempt.over and self._over_at is None:
+        if not attempt.over:  # or no more: the tip has touched again
+            self._over_at = None
+        elif self._over_at is None:
             self._over_at = replica.step
         found = None
         if self._over_at is not None and replica.step >= self._over_at + _LAST_FRAMES:
