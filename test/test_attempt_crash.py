@@ -16,6 +16,7 @@ import pytest
 from live import two_presses, write_scene
 from page_user import ROOT, View, sessions
 
+from bench.common.processes import children_of
 from bench.page.open_page import OpenPage
 
 pytestmark = [pytest.mark.thorough, pytest.mark.real_time]
@@ -63,11 +64,8 @@ def session(page: OpenPage) -> dict[str, Any]:
 
 def below(process: int) -> list[int]:
     """The processes that one has begun, and those that they have."""
-    found = []
-    for children in Path(f'/proc/{process}/task').glob('*/children'):
-        for child in map(int, children.read_text().split()):
-            found += [child, *below(child)]
-    return found
+    children = children_of(process)
+    return [*children, *(each for child in children for each in below(child))]
 
 
 def die(view: View) -> None:

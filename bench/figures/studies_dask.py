@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
+from bench.common.processes import children_of
 from bench.figures.figure import Figure
 from cutting_trainer.studies.bag_collection import find_bags
 from cutting_trainer.studies.cluster import compute, own_cluster
@@ -127,9 +128,7 @@ def _lines(output: Path) -> int:
 
 def _workers_of(process: int) -> list[int]:
     """Return the processes that compute for a study."""
-    threads = Path(f'/proc/{process}/task').glob('*/children')
-    children = [int(pid) for file in threads for pid in file.read_text().split()]
-    named = {pid: Path(f'/proc/{pid}/cmdline').read_bytes() for pid in children}
+    named = {pid: Path(f'/proc/{pid}/cmdline').read_bytes() for pid in children_of(process)}
     return [pid for pid, words in named.items() if b'multiprocessing.spawn' in words]
 
 

@@ -18,6 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from bench.common.processes import children_of
 from cutting_trainer.viewer.access_control import PageLimits, link, make_gate
 from cutting_trainer.viewer.allowed_requests import Bounds, LiveControls
 from cutting_trainer.viewer.page_protocol import AnyMessage, EStop
@@ -121,8 +122,7 @@ class OtherProcess:
     @property
     def children(self) -> int:
         """Number of its running child processes."""
-        tasks = Path(f'/proc/{self.pid}/task').glob('*/children')
-        return sum(len(task.read_text().split()) for task in tasks)
+        return len(children_of(self.pid))
 
     @property
     def connections(self) -> int:
