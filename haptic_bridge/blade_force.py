@@ -20,7 +20,7 @@ def enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> N
     if s.entered == 0 and safety.norm(out) >= max(c.entry_force, s.borne):
         s.entered = time
     if s.entered != 0:
-        safety.clamp(c.steps[1] * safety.norm(s.proxy - s.tip), out)
+        safety.clamp(c.blade_friction * safety.norm(s.proxy - s.tip), out)
 
 
 @inner
@@ -65,9 +65,8 @@ def pull_blade(
         for k in range(3):
             at[k] = s.tip[k] - slip * axis[k] - s.advanced[k]
         extrapolation.estimate(c.law, history, time, at, none, False, arms, most, out, torque)
-        limit = s.resistance
-        if c.steps[0] == 0.0 or not extrapolation.step_ahead(
-            out, history, limit, c.steps, c.length, most, s.advanced
+        if c.crack_length == 0.0 or not extrapolation.step_ahead(
+            out, history, s.resistance, c.crack_length, c.blade_friction, c.length, most, s.advanced
         ):
             break
     left = min(1.0 - s.out, 1.0)

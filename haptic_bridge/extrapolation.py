@@ -179,7 +179,8 @@ def step_ahead(
     force: np.ndarray,
     history: np.ndarray,
     limit: float,
-    steps: np.ndarray,
+    crack_length: float,
+    friction: float,
     length: float,
     max_stiffness: float,
     advanced: np.ndarray,
@@ -193,7 +194,8 @@ def step_ahead(
         force: F of `local_blade` [N], shape (3,).
         history: dtype HISTORY, shape (1,).
         limit: largest force of the blade [N].
-        steps: length a of a step [m], friction by length of the blade [N/m], shape (2,).
+        crack_length: a of a step [m].
+        friction: by length of the blade [N/m].
         length: of the blade [m].
         max_stiffness: [N/m].
         advanced: way of the edge since the newest sample [m]; changed, shape (3,).
@@ -212,8 +214,8 @@ def step_ahead(
             stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
     # Places along the blade from s to s + b: their variance is b^2 / 12.
     spread = max(h.immersed[1] - h.immersed[0] ** 2, 0.0)
-    cutting = limit - steps[1] * length * np.sqrt(12.0 * spread)
-    drop = min(stiffness * steps[0], cutting)
+    cutting = limit - friction * length * np.sqrt(12.0 * spread)
+    drop = min(stiffness * crack_length, cutting)
     if drop <= 0.0:
         return False
     way = np.ceil((size - limit) / drop) * drop / stiffness

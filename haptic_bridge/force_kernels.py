@@ -58,7 +58,8 @@ SETUP = record_type(
         ('max_force', 'f8'),  # [N]
         ('max_slew', 'f8'),  # [N/s]
         ('length', 'f8'),  # [m] of the blade, in the tissue
-        ('steps', 'f8', (2,)),  # of a crack [m], 0: none, and friction on the blade [N/m]
+        ('crack_length', 'f8'),  # [m] of a step of the crack; 0: it runs steadily
+        ('blade_friction', 'f8'),  # [N/m]
         ('entry_force', 'f8'),  # [N] that lets the blade in; inf: another rule does
         ('hand_length', 'f8'),  # [m] the same at the hand; 0: the device renders no torque
         ('max_torque', 'f8'),  # [N m]
@@ -139,8 +140,8 @@ def make_setup(
     length = math.dist(tool.blade_root, tool.blade_tip)
     setup['length'], setup['max_torque'] = length, profile.max_torque
     setup['hand_length'] = length / frame.scale if profile.max_torque > 0.0 else 0.0
-    setup['steps'] = constants.crack_length, constants.friction
-    setup['entry_force'] = constants.entry_force
+    names = ['crack_length', 'blade_friction', 'entry_force']
+    setup[names] = constants
     setup['body_frame'] = device.force_frame == 'body'
     return setup
 
@@ -266,6 +267,8 @@ def _tissue_force(
     """
     c, s, h = setup[0], state[0], history[0]
     out[:], torque[:] = 0.0, 0.0
+    if contact != TOUCHING:
+        s.entered, s.borne = 0, 0.0
     if contact == NONE:
         return
     if contact == INSIDE and s.grips > 0.0:

@@ -365,7 +365,6 @@ class ForcePath:
 
     def _leave_contact(self) -> None:
         self._proxy.reset()
-        self._s['entered'] = self._s['borne'] = 0
         self._contact = NONE
         self._left = self._sequence
         extrapolation.clear(self._history)
@@ -395,7 +394,6 @@ class ForcePath:
             if before != INSIDE:
                 self._proxy.reset()
                 self._undented.release()
-                self._s['entered'] = self._s['borne'] = 0
                 before_cut = self.force_norm / self.haptics.force_scale
                 self._s['held'] = before_cut + self.coupling.setup['slack'][0]
             self._contact = INSIDE
@@ -416,7 +414,6 @@ class ForcePath:
         if not touched.touching:
             if before == TOUCHING:
                 self._left = self._sequence
-                self._s['entered'] = self._s['borne'] = 0
             return touched
         self._undented.freeze()
         self._plausibility.note_touch(now_ns)
