@@ -116,15 +116,15 @@ def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
         rejected += [unfit(task, c) for c in found if not task.fits(c)]
         fitting = [c for c in found if task.fits(c)]
         best = None
-        while fitting and best is None:
-            best = _lighter(task, _preferred(task, fitting), depth, rejected)
-            say(f'cost of a cut with {best.name}')
-            best = with_blade(task, best)
-            if not task.fits(best):
-                rejected.append(unfit(task, best))
-                cutting = {best.integrator: best.cutting}
-                found = [replace(c, cutting=cutting.get(c.integrator, c.cutting)) for c in found]
-                fitting, best = [c for c in fitting if c.integrator not in cutting], None
+        while fitting:
+            light = _lighter(task, _preferred(task, fitting), depth, rejected)
+            cut = _with_cut(task, light, rejected, say)
+            if task.fits(cut):
+                best = cut
+                break
+            late = [c for c in found if c.integrator == cut.integrator]
+            found = [replace(c, cutting=cut.cutting) if c in late else c for c in found]
+            fitting = [c for c in fitting if c not in late]
         tried += found
         best = best or _near_the_tool(task, found, probing, depth, rejected, say)
         if best is not None:
@@ -180,6 +180,17 @@ def _candidates(
         yield Candidate(model, integrator, replace(errors, time=wrong), cost)
 
 
+def _with_cut(
+    task: Task, candidate: Candidate, rejected: list[Rejection], say: Callable[[str], None]
+) -> Candidate:
+    """Return the method with its cost in a cut; one that does not fit is rejected."""
+    say(f'cost of a cut with {candidate.name}')
+    cut = with_blade(task, candidate)
+    if not task.fits(cut):
+        rejected.append(unfit(task, cut))
+    return cut
+
+
 def _preferred(task: Task, fitting: list[Candidate]) -> Candidate:
     """Return the cheapest method.
 
@@ -219,9 +230,5 @@ def _near_the_tool(
     rejected += others
     if part is None:
         return None
-    say(f'cost of a cut with {part.name}')
-    part = with_blade(task, part)
-    if task.fits(part):
-        return part
-    rejected.append(unfit(task, part))
-    return None
+    part = _with_cut(task, part, rejected, say)
+    return part if task.fits(part) else None
