@@ -81,6 +81,17 @@ def test_the_faces_of_a_cut_do_not_pass_through_each_other(
     assert overlap(cut.mesh, cut.positions) < 1e-4
 
 
+def test_faces_that_begin_in_one_another_are_moved_apart_and_that_is_no_divergence() -> None:
+    """Their work is known, so that frames are neither taken back nor end where they began."""
+    bar = Dynamics(parted(-0.0006), Material(E, 0.0, 1000.0, 20.0, 2e-4))
+    motions = [bar.advance(Coupling()) for _ in range(40)]
+    assert not [motion.trouble for motion in motions if motion.trouble]
+    assert overlap(bar.mesh, bar.positions) < 5e-5
+    stored = E * AREA * 0.0006**2 / LENGTH / 2  # both halves are pressed by half of it
+    assert motions[-1].elastic_energy == pytest.approx(stored, rel=0.1)
+    assert bar.cut_contact.recovered > stored
+
+
 def inclined(friction: float, angle: float, fixed: bool = True) -> tuple[Dynamics, int]:
     """A block on a plate, and its first node: the meshes of their faces do not match."""
     low, plate = box((8, 4, 1), 0.005)

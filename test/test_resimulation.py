@@ -339,10 +339,12 @@ def test_beside_a_changed_session_stands_the_recorded_one(
     told = json.loads(capsys.readouterr().out)
     recorded = told['recorded']
     assert recorded['elements_cut'] == sum(report.removed for report in reports) > 100
-    assert recorded['incision_area'] == pytest.approx(sum(r.area for r in reports), rel=1e-12)
+    same = is_of_this_processor(folder)  # others round otherwise
+    area = sum(report.area for report in reports)
+    assert recorded['incision_area'] == pytest.approx(area, rel=1e-12 if same else 1e-4)
     assert recorded['largest_force'] == max(np.linalg.norm(commands, axis=1))
     assert told['changed']['elements_cut'] != recorded['elements_cut']
-    assert told['differs_from_frame'] is None or not is_of_this_processor(folder)
+    assert told['differs_from_frame'] is None or not same
 
 
 def test_cuts_of_a_changed_session_are_answered_by_the_protocol_of_its_bag(made: Path) -> None:

@@ -56,7 +56,8 @@ class CutContacts(NamedTuple):
         pulls: force on the node in the last substep, changed [N], shape (c, 3).
         gaps: at its end, changed [m], shape (c,).
         speeds: relative velocity at its end, changed [m/s], shape (c, 3).
-        scalars: coefficient of friction; energy lost [J], changed; shape (2,).
+        scalars: coefficient of friction; energy lost, and work by which faces that were in one
+            another were moved apart [J], changed; shape (3,).
     """
 
     at: np.ndarray
@@ -79,7 +80,7 @@ NO_CUT_CONTACTS = CutContacts(
     np.zeros((0, 3)),
     np.zeros(0),
     np.zeros((0, 3)),
-    np.zeros(2),
+    np.zeros(3),
 )
 
 
@@ -213,7 +214,11 @@ def meet(faces, u, v, q, beta, dt):
             _resolve(faces, c, u, v, q, beta, dt, wanted[c], response[c])
     for c in range(count):
         x, y, z = _difference(faces, u, c)
-        faces.gaps[c] = offsets[c] + x * normals[c, 0] + y * normals[c, 1] + z * normals[c, 2]
+        nx, ny, nz = normals[c, 0], normals[c, 1], normals[c, 2]
+        gap = offsets[c] + x * nx + y * ny + z * nz
+        pressed = pulls[c, 0] * nx + pulls[c, 1] * ny + pulls[c, 2] * nz
+        faces.scalars[2] += pressed * max(min(gap, 0.0) - min(faces.gaps[c], 0.0), 0.0)
+        faces.gaps[c] = gap
         x, y, z = _difference(faces, v, c)
         work = pulls[c, 0] * (speeds[c, 0] + x) + pulls[c, 1] * (speeds[c, 1] + y)
         faces.scalars[1] -= 0.5 * dt * (work + pulls[c, 2] * (speeds[c, 2] + z))
@@ -235,7 +240,7 @@ def _prepare(contacts, local, friction, pull, u, v):
     faces = CutContacts(
         3 * local, contacts.rest, contacts.smooth, np.zeros((count, 4)), np.empty((count, 4)),
         np.empty((count, 3)), np.zeros((count, 3)), np.empty(count), np.empty((count, 3)),
-        np.zeros(2),
+        np.zeros(3),
     )  # fmt: skip
     faces.scalars[0] = friction
     for c in range(count):
@@ -264,13 +269,14 @@ class CutContact:
 
     Attributes:
         lost: energy lost to friction and by faces that meet, since the start [J].
+        recovered: work by which faces that were in one another were moved apart [J].
     """
 
     def __init__(self, mesh: TetMesh, friction: float) -> None:
         self._mesh = mesh
         self._friction = friction
         self._pull = np.zeros((0, 3))
-        self.lost = 0.0
+        self.lost = self.recovered = 0.0
 
     @property
     def possible(self) -> bool:
@@ -316,7 +322,9 @@ class CutContact:
     def keep(self, contacts: NearFaces, faces: CutContacts) -> None:
         """Keep the forces that the kernels have found, and the energy lost."""
         self._pull[contacts.nodes[:, 0]] = faces.pulls
-        self.lost, faces.scalars[1] = self.lost + float(faces.scalars[1]), 0.0
+        self.lost += float(faces.scalars[1])
+        self.recovered += float(faces.scalars[2])
+        faces.scalars[1:] = 0.0
 
     def force(self, contacts: NearFaces, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the forces of cut faces on all nodes [N], shape (n, 3).
@@ -330,13 +338,13 @@ class CutContact:
         subtract_pulls(faces, out)
         return -out.reshape(-1, 3)
 
-    def kept(self) -> tuple[np.ndarray, float]:
+    def kept(self) -> tuple[np.ndarray, float, float]:
         """Return a copy of the state for `restore`."""
-        return self._pull.copy(), self.lost
+        return self._pull.copy(), self.lost, self.recovered
 
-    def restore(self, kept: tuple[np.ndarray, float]) -> None:
+    def restore(self, kept: tuple[np.ndarray, float, float]) -> None:
         """Return to a state of `kept`, which stays as it is."""
-        self._pull, self.lost = kept[0].copy(), kept[1]
+        self._pull, self.lost, self.recovered = kept[0].copy(), *kept[1:]
 
     def release(self) -> None:
         """Begin without forces."""
