@@ -8,6 +8,7 @@ from bench.figures.blade_contact import overlap, pressed, reaction, slab
 from cutting_trainer.tissue_sim.contact import cut_contact
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
+from cutting_trainer.tissue_sim.contact.cut_contact_search import NearFaces
 from cutting_trainer.tissue_sim.contact.friction import Friction
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -90,6 +91,25 @@ def test_faces_that_begin_in_one_another_are_moved_apart_and_that_is_no_divergen
     stored = E * AREA * 0.0006**2 / LENGTH / 2  # both halves are pressed by half of it
     assert motions[-1].elastic_energy == pytest.approx(stored, rel=0.1)
     assert bar.cut_contact.recovered > stored
+
+
+def test_a_triangle_that_is_pressed_flat_is_not_thrown_away() -> None:
+    """The foot is many sizes of it away then, and the force was that of the whole triangle."""
+    rest = np.array([[[1e-3, 1e-3, -1e-5], [0, 0, 0], [2e-3, 0, 0], [1e-3, 2e-3, 0]]])
+    near = NearFaces(np.arange(4)[None], rest, np.tile([0.0, 0.0, 1.0], (1, 3, 1)))
+    u, v, q = np.zeros(12), np.zeros(12), np.zeros(12)
+    v[2] = -0.1
+    contact = cut_contact.CutContact(parted(), 0.3)
+    contact._pull = np.zeros((4, 3))
+    faces = contact.operand(near, near.nodes, u, v)
+    faces.inverse[:] = 1e5
+    cut_contact.meet(faces, u, v, q, 1e-4, 1e-3)
+    assert faces.pulls[0, 2] > 0
+    u[10] = -1.998e-3
+    cut_contact.meet(faces, u, v, q, 1e-4, 1e-3)
+    force = np.zeros(12)
+    cut_contact.subtract_pulls(faces, force)
+    assert np.abs(v - 1e-3 * 1e5 * force).max() < 0.1
 
 
 def inclined(friction: float, angle: float, fixed: bool = True) -> tuple[Dynamics, int]:

@@ -13,7 +13,6 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
-from cutting_trainer.tissue_sim.motion.stability import ALL_ITERATIONS
 
 pytestmark = pytest.mark.long
 
@@ -92,7 +91,6 @@ def test_no_tangent_of_small_elements_beside_a_cut_is_faster_either(seed: int) -
     for before, after in pairwise(way):
         sweep = Sweep(before[0], before[1], after[0], after[1])
         dynamics.apply_cut(method.advance(dynamics.mesh, dynamics.mesh.rest, sweep).delta)
-    dynamics._frequency.refine(ALL_ITERATIONS)
     rest, cut = (
         dynamics.mesh.rest,
         np.unique(dynamics.mesh.triangles[dynamics.mesh.triangle_kind == CUT]),

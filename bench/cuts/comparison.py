@@ -22,7 +22,7 @@ from cutting_trainer.tissue_sim.contact.coupling import NO_SPRINGS
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.locate import distances_to_triangles
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, grown
 from cutting_trainer.tissue_sim.motion.integrators import Integrator
 from cutting_trainer.tissue_sim.motion.stability import FrequencyBound
 
@@ -60,13 +60,13 @@ class Cut:
 
     Attributes:
         mesh: after it.
-        bound: of the frequency, with the ceiling that `MAX_FREQUENCY_GROWTH` sets.
+        added: mass that `MAX_FREQUENCY_GROWTH` adds, as a share of the tissue's [-].
         milliseconds: by batch, connectivity and physics together.
         cut_elements: tetrahedra taken out or replaced.
     """
 
     mesh: TetMesh
-    bound: FrequencyBound
+    added: float
     milliseconds: list[float]
     cut_elements: int
 
@@ -120,7 +120,8 @@ def cut(stroke: Stroke, method: str) -> Cut:
     """Cut a stroke by a method, with the physics following each batch."""
     mesh = TetMesh(stroke.nodes, stroke.tetrahedra, stroke.fixed)
     model = ElasticModel(mesh, _TISSUE)
-    bound = FrequencyBound(model, _inverse(model), MAX_FREQUENCY_GROWTH)
+    inverse, inertia = _inverse(model), model.mass.copy()
+    bound = FrequencyBound(model, inverse, MAX_FREQUENCY_GROWTH)
     cutter = make_method(CuttingSettings.model_validate({'method': method}))
     milliseconds: list[float] = []
     elements = 0
@@ -137,12 +138,14 @@ def cut(stroke: Stroke, method: str) -> Cut:
             touched = mesh.apply(result.delta)
             model.update(touched)
             spent = time.thread_time() - start
-            inverse = _inverse(model)
+            n = mesh.node_count
+            inverse, inertia = grown(inverse, 3 * n), grown(inertia, n)
             start = time.thread_time()
-            bound.update(touched.nodes, inverse)
+            inertia[touched.nodes] = bound.limit(touched.nodes, inverse[: 3 * n])
             milliseconds.append(1e3 * (spent + time.thread_time() - start))
             elements += len(result.delta.removed_tetrahedra)
-    return Cut(mesh, bound, milliseconds, elements)
+    added = float(inertia[: mesh.node_count].sum() / model.mass.sum()) - 1
+    return Cut(mesh, added, milliseconds, elements)
 
 
 def _inverse(model: ElasticModel) -> Floats:
@@ -151,11 +154,9 @@ def _inverse(model: ElasticModel) -> Floats:
 
 def _row(stroke: Stroke, method: str, runs: list[Cut]) -> Row:
     before = TetMesh(stroke.nodes, stroke.tetrahedra, stroke.fixed)
-    mesh, bound = runs[0].mesh, runs[0].bound
+    mesh = runs[0].mesh
     distance, area = distances(mesh, stroke.paths, mean_edge(before))
-    model = ElasticModel(mesh, _TISSUE)
     batches = np.min([run.milliseconds for run in runs], axis=0)
-    extra = bound.inertia(np.arange(mesh.node_count)).sum() / model.mass.sum() - 1
     return Row(
         stroke.name,
         method,
@@ -164,7 +165,7 @@ def _row(stroke: Stroke, method: str, runs: list[Cut]) -> Row:
         len(before.tetrahedra),
         len(mesh.tetrahedra),
         _shrink(before, mesh),
-        100 * float(extra),
+        100 * runs[0].added,
         100 * float(1 - mesh.volumes().sum() / before.volumes().sum()),
         int(pieces(mesh).max()) + 1,
         len(batches),

@@ -41,6 +41,9 @@ _RECOVERY = 0.1
 """Share of a depth that is taken back in a substep."""
 _MAX_RECOVERY = 0.05
 """[m/s] of that at most."""
+_MAX_WEIGHT = 2.0
+"""Largest weight of a node of a triangle. Where the foot is farther off, as beside a triangle that
+is pressed flat, there is no contact: a small impulse would throw the triangle's nodes away."""
 
 
 class CutContacts(NamedTuple):
@@ -207,8 +210,12 @@ def meet(faces, u, v, q, beta, dt):
         x, y, z = _difference(faces, u, c)
         offsets[c] = gap - x * normals[c, 0] - y * normals[c, 1] - z * normals[c, 2]
         wanted[c] = min(_RECOVERY * depth, _MAX_RECOVERY * dt) - depth - offsets[c]
+        largest = 0.0
         for k in range(4):
+            largest = max(largest, abs(weights[c, k]))
             response[c] += weights[c, k] ** 2 * faces.inverse[c, k]
+        if not largest <= _MAX_WEIGHT:
+            pulls[c, 0] = pulls[c, 1] = pulls[c, 2] = response[c] = 0.0
     for c in range(count):
         if response[c] > 0.0:
             _resolve(faces, c, u, v, q, beta, dt, wanted[c], response[c])

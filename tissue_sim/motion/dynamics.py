@@ -39,7 +39,7 @@ from cutting_trainer.tissue_sim.motion.far_field import SHARES, FarField
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
 from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
 from cutting_trainer.tissue_sim.motion.loads import Loads
-from cutting_trainer.tissue_sim.motion.stability import ALL_ITERATIONS, FrequencyBound, step_bound
+from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
 from cutting_trainer.tissue_sim.motion.stiffened_mass import SUBSTEPS_BETWEEN, StiffenedMass
 
 _AT_REST = 1e-9
@@ -125,9 +125,7 @@ class Dynamics:
         self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
         growth, unscaled = self.stepping.frequency_growth, self._frequency.unscaled
         if growth < 1.0:
-            self._inertia[:] = self._frequency.slow_down()
-            self._inverse[:] = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / self._inertia), 3)
-            self._frequency.refine(ALL_ITERATIONS)
+            self._inertia[:] = self._frequency.limit(np.arange(mesh.node_count), self._inverse)
         self._uncut = self._frequency.omega
         self._stiffened: StiffenedMass | None = None
         if self.model.lawful:
@@ -262,7 +260,6 @@ class Dynamics:
             self.loads.refresh(self._u[: 3 * self.mesh.node_count])
         if self._touched or len(self._elastic.force) != self.mesh.node_count:
             self._begin_account()  # a pass over the tissue, which must not slow down a batch
-        self._frequency.refine()
         if self._cautious:
             self._cautious -= 1
             self._caution = self._caution if self._cautious else 1
@@ -631,11 +628,7 @@ class Dynamics:
         if len(self._inertia) < n:
             self._inertia = grown(self._inertia, n)
             self._inverse = grown(self._inverse, 3 * len(self._inertia))
-        self._frequency.update(nodes, self.inverse_mass)
-        self._inertia[nodes] = self._frequency.inertia(nodes)
-        free = self.mesh.fixed[nodes] == 0
-        inverse = np.where(free, 1.0 / self._inertia[nodes], 0.0)
-        self.inverse_mass.reshape(-1, 3)[nodes] = inverse[:, None]
+        self._inertia[nodes] = self._frequency.limit(nodes, self.inverse_mass)
         if self._stiffened is not None:
             self._stiffened.follow_cut()
         self._touched.append(nodes)

@@ -6,7 +6,7 @@ import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, stiffness_product
-from cutting_trainer.tissue_sim.mesh.adjacency import PATCH, spans_of, without
+from cutting_trainer.tissue_sim.mesh.adjacency import spans_of
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 
@@ -39,8 +39,19 @@ def _power_iterations(operands, spans, inverse_mass, x, f, steps):
     return quotient
 
 
-ALL_ITERATIONS = 48
-"""Power iterations after which a bound has converged."""
+_ITERATIONS = 48
+"""Power iterations after which a quotient has converged."""
+_MARGIN = 1.03
+"""Factor of a found frequency; power iterations converge from below."""
+_LEVELS = 2
+"""Neighbours of neighbours around a cut that move as its highest frequency is looked for."""
+_ROUNDS = 4
+"""Times that masses are raised after a cut, at most."""
+_FURTHER = 12
+"""Power iterations after each."""
+_ROOM = 4.0
+"""Room for the stiffening law: square of the frequency to which it raises that of a small element
+of a cut within a few substeps, over that at rest."""
 
 
 def highest_square(operands: Operands, inverse_mass: np.ndarray) -> float:
@@ -52,141 +63,88 @@ def highest_square(operands: Operands, inverse_mass: np.ndarray) -> float:
     """
     x = np.where(inverse_mass > 0.0, np.random.default_rng(0).standard_normal(len(inverse_mass)), 0)
     whole, f = np.array([[0, len(x) // 3]]), np.zeros(len(x))
-    square = _power_iterations(operands, whole, inverse_mass, x, f, ALL_ITERATIONS)
-    return FrequencyBound.MARGIN**2 * max(float(square), 0.0)
+    square = _power_iterations(operands, whole, inverse_mass, x, f, _ITERATIONS)
+    return _MARGIN**2 * max(float(square), 0.0)
 
 
 class FrequencyBound:
     """Upper bound of the highest natural frequency of a tissue under cuts.
 
-    Directly after a cut it is the larger of the old bound and Gershgorin's bound on the touched
-    rows: rigorous, local, some 40 % high. Power iterations in the next frames reduce it to 3 %
-    above the frequency they converge to. In a large tissue they use the PATCH nodes around the cut,
-    with the others held. Held nodes only remove low frequencies, and the previous bound still
-    counts.
+    Power iterations find the frequency, of the whole tissue at the start, then around each cut with
+    the nodes beyond held: that only removes low frequencies, and the bound of before still counts.
 
     A cut makes small elements, and one sliver would determine the step of the whole tissue. Nodes
-    with a row above a ceiling are therefore integrated with more mass, which reduces the row to the
-    ceiling (selective mass scaling): a few milligrams, which otherwise would only shorten the step.
+    that are faster than a ceiling are therefore integrated with more mass (selective mass scaling):
+    a few milligrams, which otherwise would only shorten the step. The mass of a node is in
+    proportion to its row in Gershgorin's bound. That bound is too high by a factor, which power
+    iterations find in the uncut tissue. Where a cut makes it larger, the masses of that cut are
+    raised until the frequency is at the ceiling. With the stiffening law they are four times as
+    large: `StiffenedMass` looks at the strain every 16 substeps, and small elements are faster.
 
     Args:
         model: the elastic model.
         inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
-        growth: the ceiling, as a multiple of the bound at the start. Below 1, small elements of the
-            mesh itself get more mass too: see `slow_down`.
+        growth: the ceiling, as a multiple of the bound at the start. Below 1, nodes of the mesh
+            itself have to be heavier too, see `limit`.
     """
-
-    MARGIN = 1.03
 
     def __init__(
         self, model: ElasticModel, inverse_mass: np.ndarray, growth: float = np.inf
     ) -> None:
         self._model = model
-        self._ceiling = np.inf
-        self._rows_over = 1.0
-        self._rows = np.zeros(model.mesh.node_count)
-        self._x = np.zeros(0)
-        self._settled = 0.0
-        self._provisional = 0.0
-        self._patch = np.zeros(0, np.int64)
-        self._cut: list[np.ndarray] = []
         self._f = np.zeros(0)
-        self.update(np.arange(model.mesh.node_count), inverse_mass)
-        self.refine(ALL_ITERATIONS)
-        self._unscaled = self._settled
-        self._ceiling = growth * self._settled
-        if growth < 1.0:  # Gershgorin's row of the worst node is that much above its frequency
-            worst = self._rows[inverse_mass[::3] > 0.0].max()
-            self._rows_over = float(worst) / self._unscaled**2
+        rows = model.frequency_rows(np.arange(model.mesh.node_count)) * model.mass
+        inverse = np.where(inverse_mass > 0.0, 1.0 / np.repeat(rows, 3), 0.0)
+        self._share = highest_square(model.operands(), inverse)
+        self._omega = float(np.sqrt(highest_square(model.operands(), inverse_mass)))
+        self._unscaled = self._omega
+        self._ceiling = growth * self._omega
 
     @property
     def unscaled(self) -> float:
         """Bound of the frequency at the start, without added mass [rad/s]."""
         return self._unscaled
 
-    def slow_down(self) -> np.ndarray:
-        """Return masses with which the nodes of a mesh are no faster than the ceiling [kg],
-        shape (n,).
-
-        Rows are scaled so that the worst has the frequency that the iterations found; the caller
-        gives the masses to `inverse_mass` and calls `refine` for the frequency that they leave.
-        """
-        self._done = 0
-        every = np.arange(self._model.mesh.node_count)
-        self._cut = [every]
-        return self.inertia(every)
-
-    def update(self, nodes: np.ndarray, inverse_mass: np.ndarray) -> None:
-        """Register the rows touched by a change of connectivity.
-
-        Args:
-            nodes: `Touched.nodes` of the batch, shape (r,).
-            inverse_mass: as for the constructor, of the mesh after it.
-        """
-        mesh = self._model.mesh
-        self._rows = grown(self._rows, mesh.node_count)
-        touched = np.asarray(nodes, np.int64)
-        self._rows[touched] = self._model.frequency_rows(touched)
-        self._inverse_mass = inverse_mass
-        worst = np.sqrt(self._rows[touched].max(initial=0.0))
-        ceiling = self._ceiling * np.sqrt(self._rows_over)
-        self._provisional = max(self._provisional, min(float(worst), float(ceiling)))
-        self._done = 0
-        # The touched nodes may have the new highest mode: start with a share of it.
-        n = mesh.node_count
-        self._x = grown(self._x, 3 * n)
-        rows = self._x[: 3 * n].reshape(-1, 3)
-        rows[touched] += 0.1 * np.random.default_rng(0).standard_normal((len(touched), 3))
-        self._cut.append(touched)
-
-    def _look_around(self) -> None:
-        """Select the nodes for the iterations: around cuts whose bound has not converged."""
-        n = self._model.mesh.node_count
-        before = self._patch[self._patch < n]
-        self._patch = np.arange(n)
-        if n > PATCH:
-            cut = np.concatenate(self._cut)
-            self._patch = self._model.neighbours.around(cut[cut < n], 2, PATCH)
-        self._x[: 3 * n].reshape(-1, 3)[without(before, self._patch)] = 0.0
-
-    def inertia(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the integration masses of some nodes [kg], shape (r,)."""
-        share = self._rows[nodes] / (self._rows_over * self._ceiling**2)
-        return np.asarray(self._model.mass[nodes] * np.maximum(1.0, share))
-
-    def refine(self, steps: int = 4) -> None:
-        """Run some power iterations unless the bound has converged.
-
-        Args:
-            steps: number of iterations.
-        """
-        if self._done >= ALL_ITERATIONS:
-            return
-        if self._done == 0:
-            self._look_around()
-        n = self._model.mesh.node_count
-        some = len(self._patch) < n
-        if len(self._f) != 3 * n:
-            self._f = np.zeros(3 * n)
-        square = _power_iterations(
-            self._model.operands(self._patch if some else None),
-            spans_of(self._patch),
-            self._inverse_mass,
-            self._x[: 3 * n],
-            self._f,
-            steps,
-        )
-        self._done += steps
-        if self._done >= ALL_ITERATIONS:
-            found = self.MARGIN * float(np.sqrt(max(square, 0.0)))
-            self._settled = max(found, self._settled) if some else found
-            self._provisional = 0.0
-            self._cut = []
-
     @property
     def omega(self) -> float:
         """Bound of the frequency [rad/s]."""
-        return max(self._settled, self._provisional)
+        return self._omega
+
+    def limit(self, nodes: np.ndarray, inverse_mass: np.ndarray) -> np.ndarray:
+        """Choose masses with which some nodes are no faster than the ceiling.
+
+        Args:
+            nodes: all at the start, then `Touched.nodes` of each batch, shape (r,).
+            inverse_mass: of the mesh as it is now, written at the nodes, shape (3 n,).
+
+        Returns:
+            Masses of the nodes for the integration [kg], shape (r,).
+        """
+        model, n = self._model, self._model.mesh.node_count
+        touched = np.asarray(nodes, np.int64)
+        patch = np.arange(n)
+        if len(touched) < n:
+            patch = model.neighbours.around(touched, _LEVELS)
+        operands = model.operands(patch if len(patch) < n else None)
+        spans, by_node = spans_of(patch), inverse_mass.reshape(-1, 3)
+        x, free = np.zeros((n, 3)), model.mesh.fixed == 0
+        self._f = grown(self._f, 3 * n)
+        x[patch] = np.random.default_rng(0).standard_normal((len(patch), 3))
+        x[~free] = 0.0
+        squares, mass = self._share * model.frequency_rows(touched), model.mass[touched]
+        free, found, heavier = free[touched], 0.0, mass
+        if model.lawful and len(touched) < n:
+            squares *= _ROOM
+        for steps in [_ITERATIONS] + [_FURTHER] * _ROUNDS:
+            heavier = mass * np.maximum(1.0, squares / self._ceiling**2)
+            by_node[touched] = np.where(free, 1.0 / heavier, 0.0)[:, None]
+            given = operands, spans, inverse_mass, x.reshape(-1), self._f[: 3 * n]
+            found = _MARGIN * float(np.sqrt(max(_power_iterations(*given, steps), 0.0)))
+            if found <= self._ceiling:
+                break
+            squares *= _MARGIN * (found / self._ceiling) ** 2
+        self._omega = found if len(patch) == n else max(found, self._omega)
+        return np.asarray(heavier)
 
 
 def amplification(
