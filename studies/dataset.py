@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import Bag, open_bag
-from cutting_trainer.bags.recorded_tissue import tissue_at
 from cutting_trainer.bags.topic_names import CONTACT, FORCE, POSE, SERVO_CF, of_session
 from cutting_trainer.node_common.cdr_codec import (
     ContactCodec,
@@ -27,9 +26,9 @@ from cutting_trainer.node_common.cdr_codec import (
     StampedCodec,
     WrenchStampedCodec,
 )
-from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies.bag_collection import StudyBag
+from cutting_trainer.studies.session_metadata import SessionMetadata
 
 Floats = NDArray[np.float64]
 
@@ -63,13 +62,16 @@ class Episode:
 
     Attributes:
         values: of each feature, each shape (n, k).
-        task: name of the scene.
         about: metadata.
     """
 
     values: dict[str, Floats]
-    task: str
     about: dict[str, Any]
+
+    @property
+    def task(self) -> str:
+        """Name of the scene."""
+        return str(self.about['scene'])
 
     @property
     def length(self) -> int:
@@ -101,11 +103,12 @@ def write_dataset(
     if output.exists():
         raise SessionError(f'{output} exists already: name a new folder for the data set')
     tasks: dict[str, int] = {}
+    metadata = SessionMetadata()
     rows, about, first, rates = [], list[dict[str, Any]](), 0, dict[int, str]()
     totals: dict[str, list[Floats]] = {}
     for number, bag in enumerate(bags):
         progress(bag.name)
-        episode, rate = _episode(bag, number)
+        episode, rate = _episode(bag, metadata)
         rates.setdefault(rate, bag.name)
         if len(rates) > 1:
             said = ' and '.join(f'{name} has {hz} Hz' for hz, name in rates.items())
@@ -139,12 +142,8 @@ def write_dataset(
                 },
             }
         )
-        about.append(episode.about)
+        about.append({'episode_index': number, **episode.about})
         first += episode.length
-    subjects = dict.fromkeys(of['subject'] for of in about if of['subject'])
-    numbers = {subject: f'subject-{number}' for number, subject in enumerate(subjects, 1)}
-    for of in about:  # a subject may have been given by a name
-        of['subject'] = numbers.get(of['subject'], '')
     _write(pa.Table.from_pylist(rows), output / 'meta/episodes/chunk-000/file-000.parquet')
     _write_tasks(list(tasks), output / 'meta/tasks.parquet')
     statistics = {name: _statistics(np.vstack(values)) for name, values in totals.items()}
@@ -170,7 +169,7 @@ def write_dataset(
     return [output / name for name in written]
 
 
-def _episode(bag: StudyBag, number: int) -> tuple[Episode, int]:
+def _episode(bag: StudyBag, metadata: SessionMetadata) -> tuple[Episode, int]:
     """Return an episode, and the rate of its ticks [Hz]."""
     opened = open_bag(bag.path)
     streams = {}
@@ -192,17 +191,7 @@ def _episode(bag: StudyBag, number: int) -> tuple[Episode, int]:
     }
     # The action is where the hand goes next.
     values['action'] = np.vstack([values['observation.state'][1:], poses[-1:]])
-    data = opened.custom_data
-    evidence = read_evidence(bag.path)
-    about = {
-        'episode_index': number,
-        'bag_hash': bag.hash,
-        'format_version': data.get('format_version', ''),
-        'subject': data.get('subject', ''),
-        'lost_messages': dict(evidence.lost),
-        'tissue_hash': f'{tissue_at(opened).hash():016x}',
-    }
-    return Episode(values, Path(data.get('scene_file', 'tissue')).stem, about), rate
+    return Episode(values, metadata.of(bag, opened)), rate
 
 
 def _stream(

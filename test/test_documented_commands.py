@@ -182,6 +182,8 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     ),
     './trainer export bags/sessions/study bags/sessions/dataset --format lerobot --licence '
     'CC-BY-4.0': Nowhere('needs ten bags: test_dataset.py exports others'),
+    './trainer export bags/sessions/study bags/sessions/study.h5 --format hdf5 --licence '
+    'CC-BY-4.0': Nowhere('needs ten bags: test_session_arrays.py exports others'),
     'python -m bench.trials.identification': Nowhere('takes an hour'),
     './trainer run python -m bench.files.lerobot_loader': Nowhere('it downloads 4 GB'),
     './trainer run dask scheduler': SCHEDULER,
