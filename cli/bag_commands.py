@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -171,9 +172,17 @@ def export(
         str,
         typer.Option('--licence', help='Licence of the recordings (hdf5, lerobot): CC-BY-4.0.'),
     ] = '',
+    video: Annotated[
+        bool,
+        typer.Option(
+            '--video', help='With pictures, 25 in a second (lerobot); slow. Needs Chromium.'
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a bag's poses and forces as tables, its tissue as a mesh, or bags as a data set."""
+    if video and form != 'lerobot':
+        raise SessionError(f'--video is for --format lerobot: {form} has no pictures')
     if form in ('hdf5', 'lerobot'):
         from cutting_trainer.studies.bag_collection import find_bags
 
@@ -182,9 +191,14 @@ def export(
         if form == 'hdf5':
             from cutting_trainer.studies.session_arrays import write_sessions as write_bags
         else:
-            from cutting_trainer.studies.dataset import write_dataset as write_bags
-        with _working('reading the bags'), reading(bag):
-            files = write_bags(find_bags([str(bag)], Path.cwd()), output, data_licence)
+            from cutting_trainer.studies.dataset import write_dataset
+
+            write_bags = partial(write_dataset, pictures=video)
+        with _working('reading the bags') as shown, reading(bag):
+            bags = find_bags([str(bag)], Path.cwd())
+            files = write_bags(
+                bags, output, data_licence, lambda name: shown.update(f'writing {escape(name)}')
+            )
         _tell_written(files, as_json=as_json)
         return
     from cutting_trainer.recordings.export_command import export as write
