@@ -29,39 +29,7 @@ from cutting_trainer.studies.session_arrays import UNITS, write_sessions
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = ROOT / 'docs' / 'studies.md'
 SAMPLES = ROOT / 'bags' / 'samples' / 'format_7'
-FOREIGN_READER = """
-import json, sys
-import h5py, numpy as np
-
-assert not any(name.startswith('cutting_trainer') for name in sys.modules)
-found = {}
-with h5py.File(sys.argv[1]) as file:
-    for session in file['sessions'].values():
-        tissue, mesh = session['tissue'], session['tissue/connectivity']
-        frames = []
-        for i, block in enumerate(tissue['block']):
-            def of(array, offset):
-                first, end = mesh[offset][block : block + 2]
-                return mesh[array][first:end]
-            first, end = tissue['displacement_offset'][i : i + 2]
-            rest = of('rest', 'node_offset')
-            places = rest + tissue['displacement'][first:end]
-            corners = places[of('tetrahedra', 'tetrahedron_offset')]
-            volume = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6
-            cut = of('triangle_kind', 'triangle_offset') == 1
-            faces = rest[of('triangles', 'triangle_offset')[cut]]
-            sides = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
-            area = np.linalg.norm(sides, axis=1).sum() / 4
-            frames.append((float(tissue['time'][i]), volume, area))
-        force = session['streams/arm_servo_cf/force'][:]
-        found[session.attrs['bag_hash']] = {
-            'largest_force': np.linalg.norm(force, axis=1).max(),
-            'force_samples': len(force),
-            'cut_area': session['cuts/area'][:].sum(),
-            'frames': frames,
-        }
-print(json.dumps(found))
-"""
+FOREIGN_READER = ROOT / 'bench' / 'files' / 'hdf5_reader.py'
 
 
 def volume(tissue) -> float:
@@ -75,7 +43,7 @@ def test_a_foreign_reader_rebuilds_each_frame_and_finds_the_figures_of_the_bags(
     bags = find_bags(['.'], SAMPLES)
     assert write_sessions(bags, tmp_path / 'set.h5', 'CC-BY-4.0') == [tmp_path / 'set.h5']
     assert [path.name for path in tmp_path.iterdir()] == ['set.h5']
-    command = [sys.executable, '-I', '-c', FOREIGN_READER, str(tmp_path / 'set.h5')]
+    command = [sys.executable, '-I', str(FOREIGN_READER), str(tmp_path / 'set.h5')]
     read = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
     assert list(read) == [bag.hash for bag in bags] and len(bags) == 3
     for bag in bags:
@@ -85,7 +53,7 @@ def test_a_foreign_reader_rebuilds_each_frame_and_finds_the_figures_of_the_bags(
         assert found['force_samples'] == len(evidence.forces)
         assert found['cut_area'] == pytest.approx(incision_area(opened), rel=1e-12)
         messages = {(m.log_time - first_time(opened)) * 1e-9 for m in tissue_messages(opened)}
-        frames = found['frames']
+        frames = found['states']
         assert {time for time, *_ in frames} <= messages and len(frames) > 70
         for time, its_volume, its_area in [*frames[::20], frames[-1]]:
             tissue = tissue_at(opened, time + 1e-6)
