@@ -5,7 +5,7 @@ from typing import Any
 
 from cutting_trainer.bags.reader import Bag
 from cutting_trainer.bags.recorded_tissue import tissue_at
-from cutting_trainer.session.bag_measurements import read_evidence
+from cutting_trainer.session.bag_measurements import lost_messages
 from cutting_trainer.studies.bag_collection import StudyBag
 
 
@@ -32,6 +32,6 @@ class SessionMetadata:
             'bag_hash': bag.hash,
             'format_version': data.get('format_version', ''),
             'subject': subject,
-            'lost_messages': dict(read_evidence(bag.path).lost),
+            'lost_messages': lost_messages(opened),
             'tissue_hash': f'{tissue_at(opened).hash():016x}',
         }

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import numpy as np
 import pytest
 
 from cutting_trainer.bags.playback_messages import first_time
-from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.reader import Bag, Recorded, open_bag
 from cutting_trainer.bags.recorded_tissue import tissue_at, tissue_messages
+from cutting_trainer.bags.topic_names import SERVO_CF
 from cutting_trainer.exercises.opened_tissue import cut_faces
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec
 from cutting_trainer.recordings.export_command import STREAMS
@@ -79,19 +81,35 @@ def test_the_program_of_the_documentation_builds_a_state_of_a_session(
     assert names['block'] > 10, 'after cuts'
 
 
-def test_the_file_says_units_licence_losses_and_the_hash_of_the_tissue(tmp_path: Path) -> None:
+def test_the_file_says_units_licence_and_the_hash_of_the_tissue(tmp_path: Path) -> None:
     (bag,) = find_bags(['straight_cut'], SAMPLES)
     write_sessions([bag], tmp_path / 'set.h5', 'CC-BY-4.0')
     with h5py.File(tmp_path / 'set.h5') as file:
         session = file['sessions/0000']
         assert file.attrs['licence'] == 'CC-BY-4.0'
         assert session.attrs['tissue_hash'] == f'{tissue_at(open_bag(bag.path)).hash():016x}'
-        lost = dict(session['lost_messages'].attrs)
-        assert lost.pop('about') and lost == read_evidence(bag.path).lost
         arrays: list[h5py.Dataset] = []
         file.visititems(lambda _, of: arrays.append(of) if isinstance(of, h5py.Dataset) else None)
         assert len(arrays) > 60 and all('unit' in array.attrs for array in arrays)
         assert session['streams/arm_servo_cf/force'].attrs['unit'] == 'N'
+
+
+def test_the_file_says_how_many_messages_were_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    all_of_them = Bag.messages
+
+    def with_gaps(bag: Bag, *arguments: Any, **options: Any) -> Iterator[Recorded]:
+        for recorded in all_of_them(bag, *arguments, **options):
+            if recorded.topic != SERVO_CF or recorded.sequence not in (100, 101, 300):
+                yield recorded
+
+    monkeypatch.setattr(Bag, 'messages', with_gaps)
+    (bag,) = find_bags(['straight_cut'], SAMPLES)
+    write_sessions([bag], tmp_path / 'set.h5', '')
+    with h5py.File(tmp_path / 'set.h5') as file:
+        lost = dict(file['sessions/0000/lost_messages'].attrs)
+    assert lost.pop('about') and lost == {SERVO_CF: 3} == read_evidence(bag.path).lost
 
 
 def test_units_are_those_of_the_message_definitions() -> None:
