@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -152,35 +153,52 @@ def export(
     output: Annotated[
         Path,
         typer.Argument(
-            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), or a folder for tables '
-            'or a data set.'
+            help='A mesh file (.vtk, .vtu: solid; .ply, .stl: surface), a file of arrays (.h5), or '
+            'a folder for tables or a data set.'
         ),
     ],
     at: Annotated[
         float | None, typer.Option(min=0.0, help='Moment of the mesh [s] (default: the end).')
     ] = None,
     form: Annotated[
-        Literal['csv', 'parquet', 'lerobot'],
+        Literal['csv', 'parquet', 'hdf5', 'lerobot'],
         typer.Option(
             '--format',
-            help='Of tables: csv, parquet; lerobot: a data set of all bags below the folder.',
+            help='Of tables: csv, parquet. Of all bags below the folder: hdf5, one file of arrays; '
+            'lerobot, a data set.',
         ),
     ] = 'csv',
     data_licence: Annotated[
         str,
-        typer.Option('--licence', help='Licence of the recordings for lerobot, as CC-BY-4.0.'),
+        typer.Option('--licence', help='Licence of the recordings (hdf5, lerobot): CC-BY-4.0.'),
     ] = '',
+    video: Annotated[
+        bool,
+        typer.Option(
+            '--video', help='With pictures, 25 in a second (lerobot); slow. Needs Chromium.'
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a bag's poses and forces as tables, its tissue as a mesh, or bags as a data set."""
-    if form == 'lerobot':
+    if video and form != 'lerobot':
+        raise SessionError(f'--video is for --format lerobot: {form} has no pictures')
+    if form in ('hdf5', 'lerobot'):
         from cutting_trainer.studies.bag_collection import find_bags
-        from cutting_trainer.studies.dataset import write_dataset
 
         if at is not None:
             raise SessionError('--at is the time of a mesh: a data set has whole sessions')
-        with _working('reading the bags'), reading(bag):
-            files = write_dataset(find_bags([str(bag)], Path.cwd()), output, data_licence)
+        if form == 'hdf5':
+            from cutting_trainer.studies.session_arrays import write_sessions as write_bags
+        else:
+            from cutting_trainer.studies.dataset import write_dataset
+
+            write_bags = partial(write_dataset, pictures=video)
+        with _working('reading the bags') as shown, reading(bag):
+            bags = find_bags([str(bag)], Path.cwd())
+            files = write_bags(
+                bags, output, data_licence, lambda name: shown.update(f'writing {escape(name)}')
+            )
         _tell_written(files, as_json=as_json)
         return
     from cutting_trainer.recordings.export_command import export as write

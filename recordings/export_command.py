@@ -27,7 +27,7 @@ from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 
 SOLIDS = ('.vtk', '.vtu')
 SURFACES = ('.ply', '.stl')
-_STREAMS: dict[str, type[StampedCodec]] = {
+STREAMS: dict[str, type[StampedCodec]] = {
     OF_DEVICE[0]: PoseStampedCodec,
     OF_DEVICE[1]: TwistStampedCodec,
     OF_DEVICE[2]: WrenchStampedCodec,
@@ -35,7 +35,7 @@ _STREAMS: dict[str, type[StampedCodec]] = {
     CONTACT: ContactCodec,
     FORCE: ForceSampleCodec,
 }
-_TYPES = {'d': np.float64, 'i': np.int32, 'I': np.uint32, 'Q': np.uint64, 'B': np.uint8}
+TYPES = {'d': np.float64, 'i': np.int32, 'I': np.uint32, 'Q': np.uint64, 'B': np.uint8}
 _AXES = {3: 'xyz', 4: 'xyzw'}
 
 
@@ -70,8 +70,8 @@ def export(folder: Path, output: Path, at: float | None, *, parquet: bool = Fals
         raise SessionError('--at is the time of a mesh: streams are written as a whole')
     if output.is_file():
         raise SessionError(f'{output} is a file: name a folder for the tables')
-    if not any(of_session(topic, bag.topics()) in bag.topics() for topic in _STREAMS):
-        raise SessionError(f'{folder} has none of the streams {", ".join(_STREAMS)}')
+    if not any(of_session(topic, bag.topics()) in bag.topics() for topic in STREAMS):
+        raise SessionError(f'{folder} has none of the streams {", ".join(STREAMS)}')
     output.mkdir(exist_ok=True)
     return write_streams(bag, output, parquet=parquet)
 
@@ -96,15 +96,20 @@ def write_streams(bag: Bag, folder: Path, *, parquet: bool) -> list[Path]:
     """Write one file a stream: time of recording [s], stamp [ns], then the fields in SI units."""
     files = []
     origin = first_time(bag)
-    for topic, kind in _STREAMS.items():
+    for topic, kind in STREAMS.items():
         name = of_session(topic, bag.topics())
         if name not in bag.topics():
             continue
         ending = 'parquet' if parquet else 'csv'
-        files.append(folder / f'{topic[1:].replace("/", "_")}.{ending}')
+        files.append(folder / f'{table_name(topic)}.{ending}')
         write = _write_parquet if parquet else _write_csv
         write(files[-1], kind, _rows(bag, name, kind(), origin))
     return files
+
+
+def table_name(topic: str) -> str:
+    """Return the name of a stream's table."""
+    return topic[1:].replace('/', '_')
 
 
 def _rows(bag: Bag, topic: str, codec: StampedCodec, origin: int) -> Iterator[Sequence[Any]]:
@@ -122,7 +127,7 @@ def _write_csv(file: Path, kind: type[StampedCodec], rows: Iterator[Sequence[Any
 
 def _write_parquet(file: Path, kind: type[StampedCodec], rows: Iterator[Sequence[Any]]) -> None:
     names = columns(kind)
-    codes = chain.from_iterable([_TYPES[code]] * count for _, code, count in kind.layout)
+    codes = chain.from_iterable([TYPES[code]] * count for _, code, count in kind.layout)
     types = [np.float64, np.int64, *codes]
     read = list(zip(*rows, strict=True)) or [()] * len(names)
     arrays = [np.array(column, type_) for column, type_ in zip(read, types, strict=True)]

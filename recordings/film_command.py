@@ -2,8 +2,8 @@
 
 import io
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -23,11 +23,14 @@ from cutting_trainer.viewer.replay_page import ReplayPage
 CODECS = {'.mp4': ('libx264', {'crf': '20'}), '.webm': ('libvpx-vp9', {'crf': '32', 'b': '0'})}
 ENDINGS = (*CODECS, '.gif')
 MAX_PICTURES = 36_000
-_VIEW = """(() => {
-    for (const id of ['views', 'guide', 'hint']) document.getElementById(id).hidden = true;
-    const r = document.getElementById('view').getBoundingClientRect();
-    return [r.x, r.y, r.width, r.height, innerWidth, innerHeight];
-})()"""
+_ALONE = """(() => {{
+    const sheet = new CSSStyleSheet();
+    sheet.replaceSync(`.view {{ position: fixed; inset: 0; }}
+        body.old .view canvas {{ opacity: 1; }}
+        body > :not(.view), .views, .guide, .hint{also} {{ display: none !important; }}`);
+    document.adoptedStyleSheets.push(sheet);
+}})()"""
+"""The tissue fills the page. No picture is old: the page has drawn the moment that is asked."""
 _DRAWN = """new Promise(done => {{
     const drawn = () => requestAnimationFrame(() => requestAnimationFrame(() => done(true)));
     const look = () => window.page?.state.playhead?.time === {time} && window.page.state.frames > 0
@@ -60,6 +63,64 @@ class FilmOptions:
     size: tuple[int, int] = (1280, 720)
 
 
+class Film:
+    """Draws a recorded session at any times.
+
+    Args:
+        page: of the session.
+        shown: in the browser.
+        gauges: with force and depth in a corner.
+
+    Attributes:
+        end: of the session [s].
+    """
+
+    def __init__(self, page: ReplayPage, shown: Page, *, gauges: bool) -> None:
+        self._page, self._shown, self.end = page, shown, page.end
+        self._draw(0.0)
+        shown.evaluate(_ALONE.format(also='' if gauges else ', .hud'))
+
+    def pictures(self, times: np.ndarray) -> Iterator[Image.Image]:
+        """Yield the picture at each time [s], shape (n,), once the page has drawn it."""
+        for now in times:
+            self._draw(float(now))
+            shot = self._shown.screenshot(optimizeForSpeed=True)  # not for size
+            yield Image.open(io.BytesIO(shot)).convert('RGB')
+
+    def _draw(self, now: float) -> None:
+        self._page.server.tick()
+        self._page.show(now)
+        self._shown.evaluate(_DRAWN.format(time=round(now, 3)))
+
+
+@contextmanager
+def open_film(
+    bag: Path, size: tuple[int, int], beside: Path | None = None, *, gauges: bool = True
+) -> Iterator[Film]:
+    """Open a recorded session to be drawn.
+
+    Args:
+        bag: folder of the bag.
+        size: of the pictures [pixel].
+        beside: folder of another bag to show beside it; None: none.
+        gauges: with force and depth in a corner.
+
+    Raises:
+        BagError, SessionError: a bag is not valid, or there is no browser.
+    """
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='trainer-')))
+        recording, other = open_recording(bag, folder / 'first'), None
+        if beside is not None:
+            other = recorded_beside(open_recording(beside, folder / 'other'), recording)
+        gate = make_gate(LOCAL, ())
+        page = ReplayPage(recording, other, LOCAL, 0, gate)
+        stack.callback(page.server.stop)
+        browser = stack.enter_context(run_browser(Page, size))
+        shown = browser.page(link(LOCAL, page.server.port, (), gate.token) + '&quality=high')
+        yield Film(page, shown, gauges=gauges)
+
+
 def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
     """Write a film; return the number of its pictures.
 
@@ -70,28 +131,30 @@ def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
     Raises:
         BagError, SessionError: an option or a bag is not valid, or there is no browser.
     """
-    if options.output.suffix not in ENDINGS:
-        raise SessionError(f'{options.output}: end its name in {", ".join(ENDINGS)}')
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='trainer-')))
-        recording, beside = open_recording(options.bag, folder / 'first'), None
-        if options.beside is not None:
-            beside = recorded_beside(open_recording(options.beside, folder / 'other'), recording)
-        gate = make_gate(LOCAL, ())
-        page = ReplayPage(recording, beside, LOCAL, 0, gate)
-        stack.callback(page.server.stop)
-        times = picture_times(options, page.end)
-        browser = stack.enter_context(run_browser(Page, options.size))
-        shown = browser.page(link(LOCAL, page.server.port, (), gate.token) + '&quality=high')
-        pictures = _pictures(page, shown, times, options.size, progress)
-        part = options.output.with_name(f'{options.output.stem}.part{options.output.suffix}')
-        stack.callback(part.unlink, missing_ok=True)
-        if part.suffix == '.gif':
-            _write_gif(part, options.fps, pictures)
-        else:
-            _write_video(part, options, pictures)
-        part.replace(options.output)
+    output = options.output
+    if output.suffix not in ENDINGS:
+        raise SessionError(f'{output}: end its name in {", ".join(ENDINGS)}')
+    with open_film(options.bag, options.size, options.beside) as film:
+        times = picture_times(options, film.end)
+        pictures = _counted(film.pictures(times), len(times), progress)
+        part = output.with_name(f'{output.stem}.part{output.suffix}')
+        try:
+            if part.suffix == '.gif':
+                _write_gif(part, options.fps, pictures)
+            else:
+                write_video(part, options.fps, options.size, pictures)
+            part.replace(output)
+        finally:
+            part.unlink(missing_ok=True)
     return len(times)
+
+
+def _counted(
+    pictures: Iterator[Image.Image], count: int, progress: Callable[[float], None]
+) -> Iterator[Image.Image]:
+    for number, picture in enumerate(pictures, 1):
+        yield picture
+        progress(number / count)
 
 
 def picture_times(options: FilmOptions, end: float) -> np.ndarray:
@@ -115,34 +178,22 @@ def picture_times(options: FilmOptions, end: float) -> np.ndarray:
     return options.start + step * np.arange(count)
 
 
-def _pictures(
-    page: ReplayPage,
-    shown: Page,
-    times: np.ndarray,
-    size: tuple[int, int],
-    progress: Callable[[float], None],
-) -> Iterator[Image.Image]:
-    """Yield the picture at each time, once the page has drawn it."""
-    page.show(float(times[0]))
-    shown.evaluate(_DRAWN.format(time=round(float(times[0]), 3)))
-    for _ in range(2):  # the picture fills what the rest of the page leaves
-        x, y, width, height, inner_width, inner_height = shown.evaluate(_VIEW)
-        shown.resize(int(inner_width + size[0] - width), int(inner_height + size[1] - height))
-    x, y, *_ = shown.evaluate(_VIEW)
-    clip = {'x': x, 'y': y, 'width': size[0], 'height': size[1], 'scale': 1}
-    for number, now in enumerate(times):
-        page.server.tick()
-        page.show(float(now))
-        shown.evaluate(_DRAWN.format(time=round(float(now), 3)))
-        yield Image.open(io.BytesIO(shown.screenshot(clip=clip))).convert('RGB')
-        progress((number + 1) / len(times))
+def write_video(
+    file: Path, fps: int, size: tuple[int, int], pictures: Iterable[Image.Image], **more: str
+) -> None:
+    """Write pictures as a video.
 
-
-def _write_video(file: Path, options: FilmOptions, pictures: Iterator[Image.Image]) -> None:
+    Args:
+        file: .mp4 or .webm.
+        fps: pictures a second.
+        size: of the pictures [pixel], even numbers.
+        pictures: in their order.
+        more: options of the encoder.
+    """
     codec, settings = CODECS[file.suffix]
     with av.open(str(file), 'w') as container:
-        stream = cast(av.VideoStream, container.add_stream(codec, options.fps, settings))
-        stream.width, stream.height = options.size
+        stream = cast(av.VideoStream, container.add_stream(codec, fps, settings | more))
+        stream.width, stream.height = size
         stream.pix_fmt = 'yuv420p'
         for picture in pictures:
             container.mux(stream.encode(av.VideoFrame.from_image(picture)))

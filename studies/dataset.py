@@ -1,13 +1,12 @@
-"""Recorded sessions as a data set of LeRobot, format v3.0: tables, no videos.
+"""Recorded sessions as a data set of LeRobot, format v3.0.
 
 Format: github.com/huggingface/lerobot, `src/lerobot/datasets/utils.py` of version 0.4. An episode
-is a bag, a frame is a tick of its force loop, so that forces keep their rate. Each stream has its
-newest value at each tick.
+is a bag.
 """
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +15,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.reader import Bag, open_bag
-from cutting_trainer.bags.recorded_tissue import tissue_at
-from cutting_trainer.bags.topic_names import CONTACT, FORCE, POSE, SERVO_CF, of_session
-from cutting_trainer.node_common.cdr_codec import (
-    ContactCodec,
-    ForceSampleCodec,
-    PoseStampedCodec,
-    StampedCodec,
-    WrenchStampedCodec,
-)
-from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.studies import dataset_video as video
 from cutting_trainer.studies.bag_collection import StudyBag
+from cutting_trainer.studies.dataset_episode import (
+    ACTION,
+    FORCES,
+    STATE,
+    STREAMS,
+    Episode,
+    read_episode,
+)
+from cutting_trainer.studies.session_metadata import SessionMetadata
 
 Floats = NDArray[np.float64]
 
@@ -39,42 +36,8 @@ _CHUNK = 1000
 """Files of a folder."""
 _DATA = 'data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet'
 _QUANTILES = {'q01': 0.01, 'q10': 0.1, 'q50': 0.5, 'q90': 0.9, 'q99': 0.99}
-_RATE_TOLERANCE = 0.02
-_STREAMS: dict[str, tuple[str, type[StampedCodec], tuple[str, ...], tuple[str, ...]]] = {
-    'observation.state': (POSE, PoseStampedCodec, ('position', 'orientation'),
-                          ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')),
-    'observation.force': (SERVO_CF, WrenchStampedCodec, ('force',), ('x', 'y', 'z')),
-    'observation.contact': (CONTACT, ContactCodec, ('state', 'device', 'proxy'),
-                            ('state', 'tip_x', 'tip_y', 'tip_z',
-                             'proxy_x', 'proxy_y', 'proxy_z')),
-    'observation.tissue': (FORCE, ForceSampleCodec,
-                           ('force', 'resistance', 'kinetic_energy', 'elastic_energy', 'topology'),
-                           ('force_x', 'force_y', 'force_z', 'resistance', 'kinetic_energy',
-                            'elastic_energy', 'cuts')),
-}  # fmt: skip
-"""Features: topic, codec, its fields, and names of the values; all in SI units."""
 _SCALARS = {'timestamp': 'float32', 'frame_index': 'int64', 'episode_index': 'int64',
             'index': 'int64', 'task_index': 'int64'}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Episode:
-    """A bag as an episode.
-
-    Attributes:
-        values: of each feature, each shape (n, k).
-        task: name of the scene.
-        about: metadata.
-    """
-
-    values: dict[str, Floats]
-    task: str
-    about: dict[str, Any]
-
-    @property
-    def length(self) -> int:
-        """Number of frames."""
-        return len(self.values['action'])
 
 
 def write_dataset(
@@ -82,6 +45,8 @@ def write_dataset(
     output: Path,
     data_licence: str,
     progress: Callable[[str], None] = lambda name: None,
+    *,
+    pictures: bool = False,
 ) -> list[Path]:
     """Write a data set, and read it back.
 
@@ -90,141 +55,138 @@ def write_dataset(
         output: new folder.
         data_licence: SPDX identifier of the recordings' licence; '': not said.
         progress: called with the name of each bag.
+        pictures: a frame is a picture of a video, not a tick of the force loop.
 
     Returns:
         Written files of metadata.
 
     Raises:
         BagError: a bag lacks a stream.
-        SessionError: the folder exists, rates differ, or a file read back differs from its bag.
+        SessionError: the folder exists, rates differ, a bag cannot be drawn, or a file read back
+            differs from its bag.
     """
     if output.exists():
         raise SessionError(f'{output} exists already: name a new folder for the data set')
-    tasks: dict[str, int] = {}
-    rows, about, first, rates = [], list[dict[str, Any]](), 0, dict[int, str]()
-    totals: dict[str, list[Floats]] = {}
-    for number, bag in enumerate(bags):
-        progress(bag.name)
-        episode, rate = _episode(bag, number)
-        rates.setdefault(rate, bag.name)
-        if len(rates) > 1:
-            said = ' and '.join(f'{name} has {hz} Hz' for hz, name in rates.items())
+    metadata = SessionMetadata()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f'{output.name}.', dir=output.parent) as temporary:
+        dataset = _Dataset(Path(temporary, output.name), pictures=pictures)
+        for bag in bags:
+            progress(bag.name)
+            dataset.add(bag, read_episode(bag, metadata))
+        names = dataset.finish(data_licence)
+        Path(temporary, output.name).rename(output)
+    return [output / name for name in names]
+
+
+class _Dataset:
+    """A data set that is written."""
+
+    def __init__(self, folder: Path, *, pictures: bool) -> None:
+        self._folder, self._pictures = folder, pictures
+        self._tasks: dict[str, int] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._about: list[dict[str, Any]] = []
+        self._rates: dict[int, str] = {}
+        self._totals: dict[str, list[Floats]] = {}
+        self._shades = video.NO_PIXELS
+        self._frames = 0
+
+    def add(self, bag: StudyBag, episode: Episode) -> None:
+        """Write an episode."""
+        rate, number = episode.rate, len(self._rows)
+        self._rates.setdefault(rate, bag.name)
+        if len(self._rates) > 1:
+            said = ' and '.join(f'{name} has {hz} Hz' for hz, name in self._rates.items())
             raise SessionError(f'{said}: a data set has one rate; export them apart')
-        task = tasks.setdefault(episode.task, len(tasks))
-        table = _table(episode, rate, number, first, task)
+        if self._pictures:
+            episode, rate = episode.by_picture(video.FPS), video.FPS
+        task = self._tasks.setdefault(episode.task, len(self._tasks))
+        table = _table(episode, rate, number, self._frames, task)
         chunk, file = divmod(number, _CHUNK)
-        path = output / _DATA.format(chunk_index=chunk, file_index=file)
+        path = self._folder / _DATA.format(chunk_index=chunk, file_index=file)
         _write(table, path)
         _check(path, episode, bag)
         columns = {**episode.values} | {
             name: np.asarray(table.column(name), float)[:, None] for name in _SCALARS
         }
+        statistics = {name: _statistics(values) for name, values in columns.items()}
         for name, values in columns.items():
-            totals.setdefault(name, []).append(values)
-        rows.append(
-            {
-                'episode_index': number,
-                'tasks': [episode.task],
-                'length': episode.length,
-                'data/chunk_index': chunk,
-                'data/file_index': file,
-                'dataset_from_index': first,
-                'dataset_to_index': first + episode.length,
-                'meta/episodes/chunk_index': 0,
-                'meta/episodes/file_index': 0,
-                **{
-                    f'stats/{name}/{kind}': value
-                    for name, values in columns.items()
-                    for kind, value in _statistics(values).items()
-                },
-            }
+            self._totals.setdefault(name, []).append(values)
+        row = {
+            'episode_index': number,
+            'tasks': [episode.task],
+            'length': episode.length,
+            'data/chunk_index': chunk,
+            'data/file_index': file,
+            'dataset_from_index': self._frames,
+            'dataset_to_index': self._frames + episode.length,
+            'meta/episodes/chunk_index': 0,
+            'meta/episodes/file_index': 0,
+        }
+        if self._pictures:
+            place = self._video(chunk, file)
+            shades = video.write_episode_video(bag.path, episode.times, place)
+            self._shades = self._shades + shades
+            statistics[video.CAMERA] = video.statistics(shades, _QUANTILES, episode.length)
+            row |= video.place_of_episode(chunk, file, episode.length)
+        row |= {
+            f'stats/{name}/{kind}': value
+            for name, of in statistics.items()
+            for kind, value in of.items()
+        }
+        self._rows.append(row)
+        self._about.append({'episode_index': number, **episode.about})
+        self._frames += episode.length
+
+    def finish(self, data_licence: str) -> list[str]:
+        """Write the metadata; return the names of their files."""
+        folder = self._folder
+        _write(
+            pa.Table.from_pylist(self._rows), folder / 'meta/episodes/chunk-000/file-000.parquet'
         )
-        about.append(episode.about)
-        first += episode.length
-    subjects = dict.fromkeys(of['subject'] for of in about if of['subject'])
-    numbers = {subject: f'subject-{number}' for number, subject in enumerate(subjects, 1)}
-    for of in about:  # a subject may have been given by a name
-        of['subject'] = numbers.get(of['subject'], '')
-    _write(pa.Table.from_pylist(rows), output / 'meta/episodes/chunk-000/file-000.parquet')
-    _write_tasks(list(tasks), output / 'meta/tasks.parquet')
-    statistics = {name: _statistics(np.vstack(values)) for name, values in totals.items()}
-    info = {
-        'codebase_version': VERSION,
-        'robot_type': 'cutting_trainer',
-        'total_episodes': len(bags),
-        'total_frames': first,
-        'total_tasks': len(tasks),
-        'chunks_size': _CHUNK,
-        'data_files_size_in_mb': 100,
-        'video_files_size_in_mb': 200,
-        'fps': next(iter(rates)),
-        'splits': {'train': f'0:{len(bags)}'},
-        'data_path': _DATA,
-        'video_path': None,
-        'features': _features(),
-        'license': data_licence,
-    }
-    written = {INFO_FILE: info, 'meta/stats.json': statistics, EPISODES_FILE: about}
-    for name, content in written.items():
-        (output / name).write_text(json.dumps(content, indent=2), encoding='utf-8')
-    return [output / name for name in written]
+        _write_tasks(list(self._tasks), folder / 'meta/tasks.parquet')
+        columns = {name: np.concatenate(values) for name, values in self._totals.items()}
+        statistics = {name: _statistics(values) for name, values in columns.items()}
+        features = _features({name: values.shape[1:] for name, values in columns.items()})
+        if self._pictures:
+            statistics[video.CAMERA] = video.statistics(self._shades, _QUANTILES, self._frames)
+            features[video.CAMERA] = video.feature(self._video(0, 0))
+        info = {
+            'codebase_version': VERSION,
+            'robot_type': 'cutting_trainer',
+            'total_episodes': len(self._rows),
+            'total_frames': self._frames,
+            'total_tasks': len(self._tasks),
+            'chunks_size': _CHUNK,
+            'data_files_size_in_mb': 100,
+            'video_files_size_in_mb': 200,
+            'fps': video.FPS if self._pictures else next(iter(self._rates)),
+            'splits': {'train': f'0:{len(self._rows)}'},
+            'data_path': _DATA,
+            'video_path': video.PATH if self._pictures else None,
+            'features': features,
+            'license': data_licence,
+        }
+        written = {INFO_FILE: info, 'meta/stats.json': statistics, EPISODES_FILE: self._about}
+        for name, content in written.items():
+            (folder / name).write_text(json.dumps(content, indent=2), encoding='utf-8')
+        return list(written)
+
+    def _video(self, chunk: int, file: int) -> Path:
+        place = {'video_key': video.CAMERA, 'chunk_index': chunk, 'file_index': file}
+        return self._folder / video.PATH.format(**place)
 
 
-def _episode(bag: StudyBag, number: int) -> tuple[Episode, int]:
-    """Return an episode, and the rate of its ticks [Hz]."""
-    opened = open_bag(bag.path)
-    streams = {}
-    for feature, (topic, codec, names, _) in _STREAMS.items():
-        streams[feature] = _stream(opened, topic, codec(), names, bag.name)
-    stamps, poses = streams['observation.state']
-    period = float(np.median(np.diff(stamps))) * 1e-9
-    rate = max(round(1.0 / period), 1)
-    if abs(rate * period - 1.0) > _RATE_TOLERANCE:
-        raise BagError(f'{bag.name} has poses every {period:.4g} s: that is no whole rate')
-    begin = max(int(of[0]) for of, _ in streams.values())
-    end = int(stamps[-1])
-    if end <= begin:
-        raise BagError(f'{bag.name} has no time in which it has all of {", ".join(_STREAMS)}')
-    ticks = begin + np.arange(int((end - begin) * 1e-9 * rate) + 1) * round(1e9 / rate)
-    values = {
-        feature: data[np.searchsorted(of, ticks, side='right') - 1]
-        for feature, (of, data) in streams.items()
-    }
-    # The action is where the hand goes next.
-    values['action'] = np.vstack([values['observation.state'][1:], poses[-1:]])
-    data = opened.custom_data
-    evidence = read_evidence(bag.path)
-    about = {
-        'episode_index': number,
-        'bag_hash': bag.hash,
-        'format_version': data.get('format_version', ''),
-        'subject': data.get('subject', ''),
-        'lost_messages': dict(evidence.lost),
-        'tissue_hash': f'{tissue_at(opened).hash():016x}',
-    }
-    return Episode(values, Path(data.get('scene_file', 'tissue')).stem, about), rate
-
-
-def _stream(
-    bag: Bag, topic: str, codec: StampedCodec, names: Sequence[str], of: str
-) -> tuple[NDArray[np.int64], Floats]:
-    """Return stamps [ns], shape (n,), and the values of some fields, shape (n, k)."""
-    found = of_session(topic, bag.topics())
-    samples = [codec.decode(recorded.data) for recorded in bag.messages([found])]
-    samples = [sample for sample in samples if sample.stamp_ns]
-    if len(samples) < 2:
-        raise BagError(f'{of} has no stream {topic}: it cannot be an episode')
-    samples.sort(key=lambda sample: sample.stamp_ns)
-    picked = [[v for name in names for v in s.values[codec.fields[name]]] for s in samples]
-    return np.array([s.stamp_ns for s in samples], np.int64), np.array(picked, float)
-
-
-def _features() -> dict[str, dict[str, Any]]:
-    names = {feature: of[3] for feature, of in _STREAMS.items()}
-    names['action'] = names['observation.state']
+def _features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, dict[str, Any]]:
+    """Return the features of the tables, by their shapes."""
+    names = {feature: list(of[3]) for feature, of in STREAMS.items()}
+    names[ACTION] = names[STATE]
+    if len(shapes[FORCES]) == 2:
+        names[FORCES] = ['tick', 'axis']
     return {
         **{
-            feature: {'dtype': 'float64', 'shape': [len(of)], 'names': list(of)}
+            feature: {'dtype': 'float64', 'shape': list(shapes[feature]), 'names': of}
             for feature, of in names.items()
         },
         **{name: {'dtype': kind, 'shape': [1], 'names': None} for name, kind in _SCALARS.items()},
@@ -233,10 +195,7 @@ def _features() -> dict[str, dict[str, Any]]:
 
 def _table(episode: Episode, rate: int, number: int, first: int, task: int) -> pa.Table:
     frames = np.arange(episode.length)
-    arrays: dict[str, Any] = {
-        name: pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
-        for name, values in episode.values.items()
-    }
+    arrays: dict[str, Any] = {name: _nested(values) for name, values in episode.values.items()}
     same = np.ones_like(frames)
     arrays |= {
         'timestamp': pa.array(frames / rate, pa.float32()),
@@ -248,8 +207,16 @@ def _table(episode: Episode, rate: int, number: int, first: int, task: int) -> p
     return pa.table(arrays)
 
 
+def _nested(values: Floats) -> pa.Array:
+    array = pa.array(values.ravel())
+    for size in reversed(values.shape[1:]):
+        array = pa.FixedSizeListArray.from_arrays(array, size)
+    return array
+
+
 def _statistics(values: Floats) -> dict[str, list[float]]:
-    """Return statistics of each column, as LeRobot has them."""
+    """Return statistics along the last axis, as LeRobot has them."""
+    frames, values = len(values), values.reshape(-1, values.shape[-1])
     kinds = {kind: np.quantile(values, share, axis=0) for kind, share in _QUANTILES.items()}
     kinds |= {
         'min': values.min(axis=0),
@@ -257,7 +224,7 @@ def _statistics(values: Floats) -> dict[str, list[float]]:
         'mean': values.mean(axis=0),
         'std': values.std(axis=0),
     }
-    return {**{kind: of.tolist() for kind, of in kinds.items()}, 'count': [len(values)]}
+    return {**{kind: of.tolist() for kind, of in kinds.items()}, 'count': [frames]}
 
 
 def _write(table: pa.Table, path: Path) -> None:
@@ -282,6 +249,8 @@ def _write_tasks(tasks: Sequence[str], path: Path) -> None:
 def _check(path: Path, episode: Episode, bag: StudyBag) -> None:
     table = pq.read_table(path)
     for name, values in episode.values.items():
-        read = table.column(name).combine_chunks().flatten().to_numpy().reshape(values.shape)
-        if not np.array_equal(read, values):
+        read = table.column(name).combine_chunks()
+        while pa.types.is_fixed_size_list(read.type):
+            read = read.flatten()
+        if not np.array_equal(read.to_numpy().reshape(values.shape), values):
             raise SessionError(f'{path} has another {name} than {bag.name}: the disk is at fault')

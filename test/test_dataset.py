@@ -9,9 +9,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from bench.files.lerobot_loader import differences, figures_of
+from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.studies.bag_collection import find_bags
+from cutting_trainer.studies.bag_collection import StudyBag, find_bags
 from cutting_trainer.studies.dataset import EPISODES_FILE, INFO_FILE, write_dataset
 from cutting_trainer.studies.evaluation import read_recording
 
@@ -43,6 +44,15 @@ def test_data_set_has_the_files_of_its_format_and_the_figures_of_its_bags(tmp_pa
     assert [of['bag_hash'] for of in about] == [bag.hash for bag in bags]
     with pytest.raises(SessionError, match='exists already'):
         write_dataset(bags, tmp_path / 'set', '')
+    assert [path.name for path in tmp_path.iterdir()] == ['set']
+
+
+def test_an_export_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    bags = find_bags(['palpation'], SAMPLES)
+    broken = StudyBag('broken', tmp_path / 'broken', '')
+    with pytest.raises(BagError, match='broken'):
+        write_dataset([*bags, broken], tmp_path / 'set', '')
+    assert not list(tmp_path.iterdir())
 
 
 def test_subjects_are_numbered_and_their_names_stay_out(tmp_path: Path) -> None:

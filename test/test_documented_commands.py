@@ -182,8 +182,16 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     ),
     './trainer export bags/sessions/study bags/sessions/dataset --format lerobot --licence '
     'CC-BY-4.0': Nowhere('needs ten bags: test_dataset.py exports others'),
+    './trainer export bags/sessions/study bags/sessions/study.h5 --format hdf5 --licence '
+    'CC-BY-4.0': Nowhere('needs ten bags: test_session_arrays.py exports others'),
     'python -m bench.trials.identification': Nowhere('takes an hour'),
-    './trainer run python -m bench.files.lerobot_loader': Nowhere('it downloads 4 GB'),
+    **{
+        f'./trainer run python -m bench.files.lerobot_loader{more}': Nowhere('it downloads 4 GB')
+        for more in ('', ' --episodes 3 --video')
+    },
+    './trainer export bags/sessions/study bags/sessions/dataset --format lerobot --video': Nowhere(
+        'needs ten bags: test_dataset_video.py exports another one'
+    ),
     './trainer run dask scheduler': SCHEDULER,
     './trainer run dask worker tcp://HOST:8786 --nthreads 1': SCHEDULER,
     './trainer study config/studies/toughness.yaml --scheduler tcp://HOST:8786': SCHEDULER,

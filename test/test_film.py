@@ -2,14 +2,21 @@
 
 from itertools import pairwise
 from pathlib import Path
+from time import sleep
+from typing import Any
 
 import av
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from cutting_trainer.recordings.film_command import FilmOptions, make_film, picture_times
-from cutting_trainer.recordings.headless_browser import CHROMIUM
+from cutting_trainer.recordings.film_command import (
+    FilmOptions,
+    make_film,
+    open_film,
+    picture_times,
+)
+from cutting_trainer.recordings.headless_browser import CHROMIUM, Page
 from cutting_trainer.session.errors import SessionError
 
 pytestmark = pytest.mark.long
@@ -62,3 +69,18 @@ def test_what_cannot_be_filmed_is_refused_in_a_sentence(tmp_path: Path) -> None:
     slow = FilmOptions(SAMPLE, tmp_path / 'cut.mp4', rate=0.01, fps=120)
     with pytest.raises(SessionError, match='36000 can be'):
         picture_times(slow, 7.0)
+
+
+@needs_browser
+def test_a_slow_browser_draws_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_once = Page.screenshot
+
+    def slowly(page: Page, **options: Any) -> bytes:
+        sleep(2.0)  # the page says after a second that its picture is old
+        return at_once(page, **options)
+
+    with open_film(SAMPLE, SIZE) as film:
+        (soon,) = film.pictures(np.array([3.0]))
+        monkeypatch.setattr(Page, 'screenshot', slowly)
+        (late,) = film.pictures(np.array([3.0]))
+    assert np.abs(np.subtract(soon, late, dtype=int)).max() < 20

@@ -124,10 +124,10 @@ def imported_by(folder: str) -> set[str]:
 @pytest.mark.parametrize('room', ROOMS)
 def test_every_library_that_a_room_imports_is_pinned_for_run_time(room: str) -> None:
     # the mesher is an extra: it has no wheels for every machine
-    # and Dask and the encoders of films are installed before their first use
+    # and Dask, the encoders of films and HDF5 are installed before their first use
     extra = {
         'mesh_import': {'pytetwild'},
-        'studies': {'dask', 'distributed', 'tornado'},
+        'studies': {'av', 'dask', 'distributed', 'h5py', 'pillow', 'tornado'},
         'recordings': {'av', 'pillow'},
     }.get(room, set())
     assert imported_by(room) <= pins('requirements.txt').keys() | extra

@@ -73,12 +73,13 @@ SUBJECTS = {
         },
     ),
     'studies': Subject(
-        modules=('studies_dask',),
+        modules=('studies_dask', 'studies_arrays'),
         not_covered={
             1: 'of it: 20 bags, 10 settings and 20 kills take minutes',
             2: 'of it: dask-jobqueue is not tried',
             3: 'it takes minutes: `python -m bench.trials.identification`',
-            4: "it needs LeRobot's own loader, in an environment of its own",
+            4: "of it: LeRobot's own loader, in an environment of its own: "
+            '`python -m bench.files.lerobot_loader`',
             5: 'it needs readers who have not seen the code',
         },
     ),
