@@ -2,7 +2,7 @@
 
 import io
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +23,10 @@ from cutting_trainer.viewer.replay_page import ReplayPage
 CODECS = {'.mp4': ('libx264', {'crf': '20'}), '.webm': ('libvpx-vp9', {'crf': '32', 'b': '0'})}
 ENDINGS = (*CODECS, '.gif')
 MAX_PICTURES = 36_000
+_PALETTE_PICTURES = 9
+"""Pictures of a film that its one palette is made of."""
 _VIEW = """(() => {
-    for (const id of ['views', 'guide', 'hint']) document.getElementById(id).hidden = true;
+    document.body.classList.add('film');
     const r = document.getElementById('view').getBoundingClientRect();
     return [r.x, r.y, r.width, r.height, innerWidth, innerHeight];
 })()"""
@@ -48,6 +50,7 @@ class FilmOptions:
         rate: seconds of the session in one second.
         fps: pictures a second.
         size: of the picture [pixel], even numbers.
+        zoom: by which the camera is nearer than that of the page.
     """
 
     bag: Path
@@ -58,6 +61,7 @@ class FilmOptions:
     rate: float = 1.0
     fps: int = 30
     size: tuple[int, int] = (1280, 720)
+    zoom: float = 1.0
 
 
 def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
@@ -83,13 +87,23 @@ def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
         times = picture_times(options, page.end)
         browser = stack.enter_context(run_browser(Page, options.size))
         shown = browser.page(link(LOCAL, page.server.port, (), gate.token) + '&quality=high')
-        pictures = _pictures(page, shown, times, options.size, progress)
+        _show(page, shown, float(times[0]))
+        clip = _clip(shown, options)
+
+        def pictures(times: np.ndarray) -> Iterator[Image.Image]:
+            for now in times:
+                page.server.tick()
+                _show(page, shown, float(now))
+                yield Image.open(io.BytesIO(shown.screenshot(clip=clip))).convert('RGB')
+
         part = options.output.with_name(f'{options.output.stem}.part{options.output.suffix}')
         stack.callback(part.unlink, missing_ok=True)
+        told = _told(pictures(times), len(times), progress)
         if part.suffix == '.gif':
-            _write_gif(part, options.fps, pictures)
+            few = np.linspace(0, len(times) - 1, min(len(times), _PALETTE_PICTURES)).astype(int)
+            _write_gif(part, options.fps, told, _palette(pictures(times[few])))
         else:
-            _write_video(part, options, pictures)
+            _write_video(part, options, told)
         part.replace(options.output)
     return len(times)
 
@@ -115,27 +129,30 @@ def picture_times(options: FilmOptions, end: float) -> np.ndarray:
     return options.start + step * np.arange(count)
 
 
-def _pictures(
-    page: ReplayPage,
-    shown: Page,
-    times: np.ndarray,
-    size: tuple[int, int],
-    progress: Callable[[float], None],
-) -> Iterator[Image.Image]:
-    """Yield the picture at each time, once the page has drawn it."""
-    page.show(float(times[0]))
-    shown.evaluate(_DRAWN.format(time=round(float(times[0]), 3)))
+def _clip(shown: Page, options: FilmOptions) -> dict[str, float]:
+    """Make room for a picture of the size, and return the part of the page that has it."""
+    width, height = options.size
     for _ in range(2):  # the picture fills what the rest of the page leaves
-        x, y, width, height, inner_width, inner_height = shown.evaluate(_VIEW)
-        shown.resize(int(inner_width + size[0] - width), int(inner_height + size[1] - height))
+        *_, wide, high, inner_width, inner_height = shown.evaluate(_VIEW)
+        shown.resize(int(inner_width + width - wide), int(inner_height + height - high))
+    shown.evaluate(f'window.page.zoom({options.zoom})')
     x, y, *_ = shown.evaluate(_VIEW)
-    clip = {'x': x, 'y': y, 'width': size[0], 'height': size[1], 'scale': 1}
-    for number, now in enumerate(times):
-        page.server.tick()
-        page.show(float(now))
-        shown.evaluate(_DRAWN.format(time=round(float(now), 3)))
-        yield Image.open(io.BytesIO(shown.screenshot(clip=clip))).convert('RGB')
-        progress((number + 1) / len(times))
+    return {'x': x, 'y': y, 'width': width, 'height': height, 'scale': 1}
+
+
+def _show(page: ReplayPage, shown: Page, now: float) -> None:
+    """Go to a time [s], and return once the page has drawn it."""
+    page.show(now)
+    shown.evaluate(_DRAWN.format(time=round(now, 3)))
+
+
+def _told(
+    pictures: Iterable[Image.Image], count: int, progress: Callable[[float], None]
+) -> Iterator[Image.Image]:
+    """Yield pictures, and tell the share of them that is done."""
+    for number, picture in enumerate(pictures):
+        yield picture
+        progress((number + 1) / count)
 
 
 def _write_video(file: Path, options: FilmOptions, pictures: Iterator[Image.Image]) -> None:
@@ -149,8 +166,13 @@ def _write_video(file: Path, options: FilmOptions, pictures: Iterator[Image.Imag
         container.mux(stream.encode())
 
 
-def _write_gif(file: Path, fps: int, pictures: Iterator[Image.Image]) -> None:
+def _palette(pictures: Iterable[Image.Image]) -> Image.Image:
+    """Return the common palette of pictures; small parts of a colour of their own keep it."""
+    together = np.concatenate([np.asarray(picture) for picture in pictures])
+    return Image.fromarray(together).quantize(method=Image.Quantize.FASTOCTREE)
+
+
+def _write_gif(file: Path, fps: int, pictures: Iterator[Image.Image], palette: Image.Image) -> None:
     # One palette without dither: what stands still takes no bytes.
-    first = next(pictures).quantize(dither=Image.Dither.NONE)
-    others = (picture.quantize(palette=first, dither=Image.Dither.NONE) for picture in pictures)
-    first.save(file, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+    made = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+    next(made).save(file, save_all=True, append_images=made, duration=round(1000 / fps), loop=0)

@@ -271,7 +271,7 @@ function snapshot() {
   };
 }
 
-/** For tests: the state of the page, and the window position of a point of the tissue frame. */
+/** For tests and films: the state of the page, the window position of a point of the tissue frame, and the camera. */
 Object.defineProperty(window, 'page', {
   value: Object.freeze({
     get state() {
@@ -280,6 +280,9 @@ Object.defineProperty(window, 'page', {
     project(point) {
       const { x, y } = stage.project({ x: point[0], y: point[1], z: point[2] });
       return [x, y];
+    },
+    zoom(factor) {
+      stage.zoom(factor);
     },
   }),
 });
