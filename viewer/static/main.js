@@ -122,7 +122,7 @@ function begin(hello) {
   $('training').hidden = !hello.session;
   onStage(() => {
     stage.begin(hello);
-    guide.bounds = hello.bounds ?? null;
+    guide.begin(hello);
     showGuide();
   });
 }
