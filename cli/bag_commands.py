@@ -79,12 +79,16 @@ def film(
     size: Annotated[
         tuple[int, int], typer.Option(min=64, max=4096, help='Width and height [pixel].')
     ] = (1280, 720),
+    zoom: Annotated[
+        float, typer.Option(min=0.2, max=8.0, help='How much nearer than on the page.')
+    ] = 1.0,
     as_json: AsJson = False,
 ) -> None:
     """Write a recorded session as a moving picture, drawn by the page. Needs Chromium."""
     from cutting_trainer.recordings.film_command import FilmOptions, make_film
 
-    options = FilmOptions(bag, output, beside, start, end, rate, fps, (size[0] & -2, size[1] & -2))
+    even = size[0] & -2, size[1] & -2
+    options = FilmOptions(bag, output, beside, start, end, rate, fps, even, zoom)
     with Progress(console=Console(stderr=True), transient=True) as shown, reading(bag):
         task = shown.add_task('drawing', total=1.0)
         make_film(options, lambda share: shown.update(task, completed=share))

@@ -23,6 +23,8 @@ from cutting_trainer.viewer.replay_page import ReplayPage
 CODECS = {'.mp4': ('libx264', {'crf': '20'}), '.webm': ('libvpx-vp9', {'crf': '32', 'b': '0'})}
 ENDINGS = (*CODECS, '.gif')
 MAX_PICTURES = 36_000
+_PALETTE_PICTURES = 9
+"""Pictures of a film that its one palette is made of."""
 _ALONE = """(() => {{
     const sheet = new CSSStyleSheet();
     sheet.replaceSync(`.view {{ position: fixed; inset: 0; }}
@@ -51,6 +53,7 @@ class FilmOptions:
         rate: seconds of the session in one second.
         fps: pictures a second.
         size: of the picture [pixel], even numbers.
+        zoom: by which the camera is nearer than that of the page.
     """
 
     bag: Path
@@ -61,6 +64,7 @@ class FilmOptions:
     rate: float = 1.0
     fps: int = 30
     size: tuple[int, int] = (1280, 720)
+    zoom: float = 1.0
 
 
 class Film:
@@ -69,16 +73,18 @@ class Film:
     Args:
         page: of the session.
         shown: in the browser.
+        zoom: by which the camera is nearer than that of the page.
         gauges: with force and depth in a corner.
 
     Attributes:
         end: of the session [s].
     """
 
-    def __init__(self, page: ReplayPage, shown: Page, *, gauges: bool) -> None:
+    def __init__(self, page: ReplayPage, shown: Page, zoom: float, *, gauges: bool) -> None:
         self._page, self._shown, self.end = page, shown, page.end
         self._draw(0.0)
         shown.evaluate(_ALONE.format(also='' if gauges else ', .hud'))
+        shown.evaluate(f'window.page.zoom({zoom})')
 
     def pictures(self, times: np.ndarray) -> Iterator[Image.Image]:
         """Yield the picture at each time [s], shape (n,), once the page has drawn it."""
@@ -95,7 +101,12 @@ class Film:
 
 @contextmanager
 def open_film(
-    bag: Path, size: tuple[int, int], beside: Path | None = None, *, gauges: bool = True
+    bag: Path,
+    size: tuple[int, int],
+    beside: Path | None = None,
+    *,
+    zoom: float = 1.0,
+    gauges: bool = True,
 ) -> Iterator[Film]:
     """Open a recorded session to be drawn.
 
@@ -103,6 +114,7 @@ def open_film(
         bag: folder of the bag.
         size: of the pictures [pixel].
         beside: folder of another bag to show beside it; None: none.
+        zoom: by which the camera is nearer than that of the page.
         gauges: with force and depth in a corner.
 
     Raises:
@@ -118,7 +130,7 @@ def open_film(
         stack.callback(page.server.stop)
         browser = stack.enter_context(run_browser(Page, size))
         shown = browser.page(link(LOCAL, page.server.port, (), gate.token) + '&quality=high')
-        yield Film(page, shown, gauges=gauges)
+        yield Film(page, shown, zoom, gauges=gauges)
 
 
 def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
@@ -134,13 +146,15 @@ def make_film(options: FilmOptions, progress: Callable[[float], None]) -> int:
     output = options.output
     if output.suffix not in ENDINGS:
         raise SessionError(f'{output}: end its name in {", ".join(ENDINGS)}')
-    with open_film(options.bag, options.size, options.beside) as film:
+    with open_film(options.bag, options.size, options.beside, zoom=options.zoom) as film:
         times = picture_times(options, film.end)
         pictures = _counted(film.pictures(times), len(times), progress)
         part = output.with_name(f'{output.stem}.part{output.suffix}')
         try:
             if part.suffix == '.gif':
-                _write_gif(part, options.fps, pictures)
+                few = np.linspace(0, len(times) - 1, min(len(times), _PALETTE_PICTURES)).astype(int)
+                palette = _palette(film.pictures(times[few]))
+                _write_gif(part, options.fps, pictures, palette)
             else:
                 write_video(part, options.fps, options.size, pictures)
             part.replace(output)
@@ -200,8 +214,13 @@ def write_video(
         container.mux(stream.encode())
 
 
-def _write_gif(file: Path, fps: int, pictures: Iterator[Image.Image]) -> None:
+def _palette(pictures: Iterable[Image.Image]) -> Image.Image:
+    """Return the common palette of pictures; small parts of a colour of their own keep it."""
+    together = np.concatenate([np.asarray(picture) for picture in pictures])
+    return Image.fromarray(together).quantize(method=Image.Quantize.FASTOCTREE)
+
+
+def _write_gif(file: Path, fps: int, pictures: Iterator[Image.Image], palette: Image.Image) -> None:
     # One palette without dither: what stands still takes no bytes.
-    first = next(pictures).quantize(dither=Image.Dither.NONE)
-    others = (picture.quantize(palette=first, dither=Image.Dither.NONE) for picture in pictures)
-    first.save(file, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+    made = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+    next(made).save(file, save_all=True, append_images=made, duration=round(1000 / fps), loop=0)

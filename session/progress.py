@@ -60,9 +60,10 @@ class SessionProgress:
             )
             self._plainly(f'{event.node} is ready')
         elif event.kind == 'message':
-            if page := event.content.get('page'):
-                link = escape(str(page)[:_MAX_LINK])
-                self._console.print(f'page: {link}', highlight=False, soft_wrap=True)
+            for whose in ('page', 'instructor'):
+                if page := event.content.get(whose):
+                    link = escape(str(page)[:_MAX_LINK])
+                    self._console.print(f'{whose}: {link}', highlight=False, soft_wrap=True)
         elif event.kind == 'phase':
             self._phase = text
             self._plainly(text)

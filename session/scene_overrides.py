@@ -1,5 +1,6 @@
 """A scene with some values replaced, as a file that nodes can read."""
 
+import json
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
@@ -10,15 +11,17 @@ from ruamel.yaml.error import YAMLError
 from cutting_trainer.node_common.scene_reader import check_yaml
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import Scene
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 
-def write_changed(scene: Scene, folder: Path, changes: Mapping[str, str]) -> Path:
-    """Write a scene under its own name.
+def write_changed(scene: Scene, folder: Path, changes: Mapping[str, str], name: str = '') -> Path:
+    """Write a changed scene.
 
     Args:
         scene: as it is.
         folder: where to; exists.
         changes: by dotted key, in YAML.
+        name: of the changed scene; '': its own.
 
     Returns:
         The file.
@@ -31,7 +34,7 @@ def write_changed(scene: Scene, folder: Path, changes: Mapping[str, str]) -> Pat
     content['tissue']['mesh'] = str(scene.tissue.mesh)
     for key, value in changes.items():
         change(content, key, value)
-    path, out = folder / scene.path.name, StringIO()
+    path, out = folder / f'{name or scene.path.stem}.yaml', StringIO()
     yaml.dump(content, out)
     path.write_text(out.getvalue(), encoding='utf-8')
     return path
@@ -80,3 +83,25 @@ def change(scene: dict[str, object], key: str, value: str) -> None:
             raise SessionError(f'--with {key}: {part} has no keys, it is a value')
         place = inner
     place[last] = new
+
+
+def tissue_changes(tissue: TissueSettings, factors: Mapping[str, float]) -> dict[str, str]:
+    """Return the changes that make a tissue stiffer or tougher, in all its regions.
+
+    Args:
+        tissue: as its scene has it.
+        factors: of Young's modulus, `stiffness`, and of `toughness`.
+    """
+    changes = {}
+    names = {'youngs_modulus': factors['stiffness'], 'toughness': factors['toughness']}
+    changed = {name: factor for name, factor in names.items() if factor != 1.0}
+    for name, factor in changed.items():
+        changes[f'tissue.material.{name}'] = f'{factor * getattr(tissue.material, name):g}'
+    if changed and tissue.regions:
+        regions = [
+            region.model_dump(exclude_none=True)
+            | {name: factor * tissue.region_values(name)[i] for name, factor in changed.items()}
+            for i, region in enumerate(tissue.regions)
+        ]
+        changes['tissue.regions'] = json.dumps(regions)
+    return changes

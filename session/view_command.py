@@ -3,7 +3,7 @@
 import json
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -35,11 +35,12 @@ from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.probe_command import ProbeOptions, probe
 from cutting_trainer.session.progress import SessionProgress
 from cutting_trainer.session.scene_loader import Scene, load_scene
-from cutting_trainer.session.scene_overrides import write_changed
+from cutting_trainer.session.scene_overrides import tissue_changes, write_changed
 from cutting_trainer.session.supervisor import Event, Supervisor
 from cutting_trainer.session.terminal import session_console
-from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, make_gate
-from cutting_trainer.viewer.live_page import METHODS
+from cutting_trainer.viewer.access_control import INSTRUCTOR_VARIABLE, TOKEN_VARIABLE, make_gate
+from cutting_trainer.viewer.allowed_requests import TISSUE_FACTORS
+from cutting_trainer.viewer.live_page import METHODS, OWN_TISSUE
 
 _FOREVER = 1e9
 _MAX_REQUESTS = 16
@@ -86,6 +87,7 @@ def run_view(options: ViewOptions) -> Status:
     # Rejected here, before the start of any node; every start of the viewer has the token.
     gate = make_gate(options.host, options.allow_host)
     os.environ[TOKEN_VARIABLE] = gate.token
+    os.environ[INSTRUCTOR_VARIABLE] = gate.instructor_token
     viewer = viewer_command(
         scene.path,
         options.host,
@@ -183,6 +185,7 @@ class _Session:
         self._sources = {scene.name: options.scene}  # the name alone may not lead to the file
         self._file = scene.path
         self._method: str = scene.cutting.method
+        self._tissue = OWN_TISSUE
         self._recording: Path | None = None
         self._subject, self._is_attempt = '', False
         self._attempts = AttemptList()
@@ -209,7 +212,7 @@ class _Session:
         said = {}
         if self._scene.exercise.title:
             self._subject = self._subject or new_pseudonym()
-            said = attempt_data(bag.parent, self._scene.name, self._subject, '')
+            said = attempt_data(bag.parent, self._file.stem, self._subject, '')
         return recorder_command(self._file, bag, self._options.seed, said)
 
     def close(self) -> None:
@@ -267,7 +270,7 @@ class _Session:
                 raise SessionError('the requested scene is not one of those on offer')
             if (method := request.get('method', self._method)) not in METHODS:
                 raise SessionError('the requested method of cutting does not exist')
-            self._restart(name, method, supervisor)
+            self._restart(name, method, supervisor, _tissue(request.get('tissue', self._tissue)))
         elif request['ask'] == 'attempt':
             self._begin_attempt(request['scene'], request['subject'], supervisor)
         elif request['ask'] == 'finish':  # the attempt has a score
@@ -287,7 +290,7 @@ class _Session:
         if name not in scene_names() or not (scene := load_scene(name)).exercise.title:
             raise SessionError('the requested exercise is not one of those on offer')
         self._subject = str(subject) or self._subject
-        self._restart(name, scene.cutting.method, supervisor, attempt=True)
+        self._restart(name, scene.cutting.method, supervisor, OWN_TISSUE, attempt=True)
 
     def _record(self, on: bool, supervisor: Supervisor) -> None:
         """Start a bag, or end the present one."""
@@ -310,7 +313,13 @@ class _Session:
         self._attempts.refresh()
 
     def _restart(
-        self, name: str, method: str, supervisor: Supervisor, *, attempt: bool = False
+        self,
+        name: str,
+        method: str,
+        supervisor: Supervisor,
+        tissue: dict[str, float],
+        *,
+        attempt: bool = False,
     ) -> None:
         """Restart the nodes. A bag holds one tissue: the present one ends, and a new one starts.
 
@@ -318,19 +327,25 @@ class _Session:
             name: of the scene.
             method: of cutting.
             supervisor: of the nodes.
+            tissue: factors of stiffness and toughness; another scene has its own.
             attempt: record an attempt from the start.
         """
         scene = load_scene(self._sources.get(name, name))
         changes = {} if method == scene.cutting.method else {'cutting.method': method}
         if scene.name != self._scene.name and method == self._method:
             changes, method = {}, scene.cutting.method  # another scene has its own method
+        if scene.name != self._scene.name:
+            tissue = OWN_TISSUE
+        changes |= tissue_changes(scene.tissue, tissue)
         recorded, again = self._recording is not None, self._is_attempt
         self._answer(supervisor, busy='The nodes start again ...')
         if recorded:
             self._end_bag(supervisor)
         before = [command.name for command in self.nodes()]
-        self._scene, self._method = scene, method
-        self._file = write_changed(scene, self._folder, changes) if changes else scene.path
+        self._scene, self._method, self._tissue = scene, method, tissue
+        # Scores with another tissue do not compare: they are of an exercise of another name.
+        name = scene.name if tissue == OWN_TISSUE else _name(scene.name, tissue)
+        self._file = write_changed(scene, self._folder, changes, name) if changes else scene.path
         self._is_new = True  # the file may have changed under the same name
         nodes = self.nodes()
         supervisor.remove(set(before) - {command.name for command in nodes})
@@ -357,6 +372,7 @@ class _Session:
         state = {
             'scene': self._scene.name,
             'method': self._method,
+            'tissue': self._tissue,
             'recording': self._recording.name if self._recording else '',
             'busy': busy,
             'problem': problem,
@@ -365,3 +381,21 @@ class _Session:
         }
         self._is_new = self._is_new and not sends_file
         supervisor.answer(VIEWER_NODE, json.dumps(state))
+
+
+def _name(scene: str, tissue: Mapping[str, float]) -> str:
+    """Return the name of a scene with another tissue, as `pad-stiffness-1.5-toughness-1`."""
+    return '-'.join([scene, *(f'{name}-{factor:g}' for name, factor in tissue.items())])
+
+
+def _tissue(asked: Mapping[str, float]) -> dict[str, float]:
+    """Return the requested factors of the tissue.
+
+    Raises:
+        SessionError: one is not on offer.
+    """
+    low, high = TISSUE_FACTORS
+    factors = {name: float(asked[name]) for name in OWN_TISSUE}
+    if not all(low <= factor <= high for factor in factors.values()):
+        raise SessionError('the requested tissue is not one of those on offer')
+    return factors

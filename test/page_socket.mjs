@@ -60,7 +60,7 @@ const { Stop } = await import('./stop.mjs');
 const element = () => ({ addEventListener() {}, setAttribute() {} });
 const warnings = [];
 let stop = null;
-const connection = new Connection({ text: (message) => stop.show(message.e_stopped) }, () => {});
+const connection = new Connection({ text: (message) => stop.show(message.e_stopped) }, () => {}, 'session');
 stop = new Stop(element(), element(), connection, (text) => warnings.push(text));
 connection.open();
 

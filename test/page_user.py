@@ -39,13 +39,14 @@ class View:
                 start_new_session=True,
             )
 
-    def url(self) -> str:
-        """Where the page is, once all nodes are ready."""
+    def url(self, whose: str = 'page') -> str:
+        """Where the page is, or that of the `instructor`, once all nodes are ready."""
         deadline = time.monotonic() + 240
         while self._said.read_text().count(' is ready') < 5:
             assert self.process.poll() is None and time.monotonic() < deadline, self.said
             time.sleep(0.1)
-        found = re.search(r'page: (http://127\.0\.0\.1:\d+/\?token=\S+)$', self.said, re.MULTILINE)
+        pattern = rf'^{whose}: (http://127\.0\.0\.1:\d+/\w*\?token=\S+)$'
+        found = re.search(pattern, self.said, re.MULTILINE)
         assert found, self.said
         return found[1]
 

@@ -28,10 +28,19 @@ from cutting_trainer.viewer.appearance import (
 )
 from cutting_trainer.viewer.colours import OTHER_TISSUE
 from cutting_trainer.viewer.drawn_surface import CUT, TissueSource
-from cutting_trainer.viewer.page_protocol import AnyMessage, Guide, Record, Scale, Watch
+from cutting_trainer.viewer.live_page import OWN_TISSUE
+from cutting_trainer.viewer.page_protocol import (
+    AnyMessage,
+    Guide,
+    Hold,
+    Record,
+    Scale,
+    SetTissue,
+    Watch,
+)
 from cutting_trainer.viewer.page_server import PageServer
 
-TOKEN = 'stand-in'
+TOKEN, INSTRUCTOR = 'stand-in', 'stand-in-instructor'
 PERIOD = 1 / 30
 SPEED = 0.3
 """[m/s] of the hand."""
@@ -83,6 +92,7 @@ class StandIn:
         self.tip = np.array([*positions.mean(axis=0)[:2], positions[:, 2].max() + 0.02])
         self.goal = self.tip.copy()
         self.state, self.e_stopped, self.recording = 'DISABLED', False, ''
+        self.held, self.tissue = False, dict(OWN_TISSUE)
         self.clutched = False
         self._mode, self._says = mode, says
         self._controls: Any = LiveControls(
@@ -96,9 +106,10 @@ class StandIn:
         )
         if mode == 'replay':
             self._controls = ReplayControls(20.0, (0.25, 1.0, 4.0))
-        gate = Gate(frozenset({'127.0.0.1', 'localhost'}), TOKEN)
+        gate = Gate(frozenset({'127.0.0.1', 'localhost'}), TOKEN, INSTRUCTOR)
         self.server = PageServer('127.0.0.1', port, gate, mode, self._controls, self._act)
         self.url = link('127.0.0.1', self.server.port, (), TOKEN)
+        self.instructor = link('127.0.0.1', self.server.port, (), INSTRUCTOR, 'instructor')
         self._sources = [TissueSource('tissue'), TissueSource('computed')]
         self._ends = threading.Event()
         self.stands_still = threading.Event()
@@ -180,6 +191,10 @@ class StandIn:
             self.e_stopped = False
         elif word in ('start', 'pause'):
             self.state = 'ENABLED' if word == 'start' else 'PAUSED'
+        elif isinstance(message, Hold):
+            self.held, self.state = message.on, 'PAUSED' if message.on else 'ENABLED'
+        elif isinstance(message, SetTissue):
+            self.tissue = {'stiffness': message.stiffness, 'toughness': message.toughness}
         elif isinstance(message, Guide):
             self.goal = np.array(message.position)
         elif isinstance(message, Record):
@@ -246,6 +261,7 @@ class StandIn:
             can_guide=self.state == 'ENABLED',
             e_stopped=self.e_stopped,
             recording=bool(self.recording),
+            held=self.held,
         )
         if changed != self._controls:
             self._controls = changed
@@ -254,7 +270,9 @@ class StandIn:
             'state': {
                 'state': self.state,
                 'text': text.get(self.state, 'No force. Start enables it.'),
+                'guided': '',
                 'e_stopped': self.e_stopped,
+                'held': self.held,
             },
             'attempts': {'rows': ATTEMPTS},
             'session': {
@@ -263,6 +281,7 @@ class StandIn:
                 'recording': self.recording,
                 'busy': '',
                 'scenes': ['block', 'liver'],
+                'tissue': self.tissue,
             },
             'nodes': {
                 'rows': [

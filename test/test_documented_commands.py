@@ -144,6 +144,9 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer run python -m bench.files.damaged_bags BAG 300': Nowhere(
         'takes minutes: test_damaged_bags.py does it to fewer copies'
     ),
+    'python -m bench.page.demo_film': Nowhere(
+        'it takes a demo and a minute: test_film.py makes shorter films'
+    ),
     'python -m bench.page.frame_rate BAG': Nowhere('it measures the speed of a browser'),
     'python -m bench.page.latency URL': Nowhere('it measures the speed of a browser and a graph'),
     'python -m bench.cuts.severance': Nowhere(

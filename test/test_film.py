@@ -8,6 +8,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from page_user import cut_coloured, reddish
 from PIL import Image, ImageSequence
 
 from cutting_trainer.recordings.film_command import (
@@ -18,6 +19,7 @@ from cutting_trainer.recordings.film_command import (
 )
 from cutting_trainer.recordings.headless_browser import CHROMIUM, Page
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.viewer.page_server import PageServer
 
 pytestmark = pytest.mark.long
 
@@ -28,9 +30,11 @@ needs_browser = pytest.mark.skipif(
 )
 
 
-def film(file: Path, start: float, end: float) -> tuple[int, list[float]]:
+def film(
+    file: Path, start: float, end: float, fps: int = 5, zoom: float = 1.0
+) -> tuple[int, list[float]]:
     shares: list[float] = []
-    options = FilmOptions(SAMPLE, file, start=start, end=end, fps=5, size=SIZE)
+    options = FilmOptions(SAMPLE, file, start=start, end=end, fps=fps, size=SIZE, zoom=zoom)
     return make_film(options, shares.append), shares
 
 
@@ -49,6 +53,32 @@ def test_a_film_has_the_pictures_of_its_times_and_the_tissue_is_opened_in_it(
     assert min(red) > 100, 'tissue is in every picture'
     moving = [np.abs(np.subtract(a, b, dtype=float)).mean() for a, b in pairwise(pictures)]
     assert max(moving) > 0.1, 'something moves'
+
+
+@needs_browser
+def test_a_gif_shows_the_cut_in_its_colour_and_from_nearer_more_tissue(tmp_path: Path) -> None:
+    found = []
+    for zoom in (1.0, 2.0):
+        film(tmp_path / 'cut.gif', 0.0, 6.0, fps=1, zoom=zoom)
+        with Image.open(tmp_path / 'cut.gif') as made:
+            made.seek(made.n_frames - 1)
+            found.append(np.asarray(made.convert('RGB')))
+    far, near = (int(reddish(picture).sum()) for picture in found)
+    assert near > 2 * far > 0
+    assert int(cut_coloured(found[1]).sum()) > 30
+
+
+@needs_browser
+def test_a_film_says_nowhere_that_its_picture_is_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PageServer, 'tick', lambda self: setattr(self, '_ticked', -1e3))
+    film(tmp_path / 'cut.mp4', 0.0, 6.0)
+    with av.open(str(tmp_path / 'cut.mp4')) as container:
+        for frame in container.decode(video=0):
+            r, g, b = frame.to_ndarray(format='rgb24').astype(int).transpose(2, 0, 1)
+            amber = (r > 200) & (g > 130) & (b < 110)
+            assert int(amber.sum()) < 100, 'the goal has this colour too, and the banner thousands'
 
 
 @needs_browser

@@ -15,6 +15,7 @@ import pytest
 from page_world import StandIn
 
 from bench.page.browser import CHROMIUM, Browser, Page, chromium
+from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.viewer.page_protocol import (
     Attempt,
     EStop,
@@ -249,6 +250,46 @@ def test_no_goal_jumps_and_the_edge_turns_to_the_stroke(browser: Browser) -> Non
         turns = 2 * np.arctan2(*np.array([[g.wxyz[3], g.wxyz[0]] for g in goals]).T)
         assert np.abs(np.diff(turns)).max() < 0.41
         assert turns[-1] == pytest.approx(np.pi / 2, abs=0.15)  # the stroke is along y
+
+
+def test_the_blade_is_pushed_no_deeper_than_moments_say_that_it_is_not_in(
+    browser: Browser,
+) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        top = on_top(stand_in, 0.0, 0.0)
+        x, y = page.pixels(top[None])[0]
+        page.mouse('mouseMoved', x, y)
+        stand_in.wait(lambda: stand_in.of(Guide))
+        page.mouse('mousePressed', x, y, pressed=True)
+
+        def depth() -> float:
+            return float(top[2] - end_of_blade(stand_in.of(Guide)[-1])[2])
+
+        stand_in.wait(lambda: depth() > 0.008)  # it is pushed beyond the depth of 6 mm
+        stand_in.stands_still.set()
+        time.sleep(0.1)
+        before = depth()
+        time.sleep(0.6)  # the picture is not called old before a second is over
+        assert depth() < before + 0.002
+        stand_in.stands_still.clear()
+        stand_in.wait(lambda: depth() > 0.021)
+        page.mouse('mouseReleased', x, y)
+
+
+def test_a_lift_on_a_long_way_ends_no_attempt(browser: Browser) -> None:
+    stand_in, end = StandIn('vessel'), load_scene('vessel').exercise.end
+    assert end is not None
+    with opened(browser, stand_in) as page:
+        guided(page)
+        places = [on_top(stand_in, x, 0.0) for x in (-0.022, end.centre[0])]
+        for place in places:
+            before = len(stand_in.of(Guide))
+            page.mouse('mouseMoved', *page.pixels(place[None])[0])
+            stand_in.wait(lambda place=place: np.allclose(stand_in.tip[:2], place[:2], atol=1e-3))
+        highest = max(goal.position[2] for goal in stand_in.of(Guide)[before:])
+        assert places[1][2] + 0.012 < highest < end.centre[2] - end.radius
 
 
 def test_wheel_keys_and_the_button_that_stays_set_depth_and_cut(browser: Browser) -> None:

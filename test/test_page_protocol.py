@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from websockets.datastructures import Headers
 
 from bench.page.fuzz_socket import text
-from bench.page.stand_in import CONTROLS, GATE, TOKEN, VALID
+from bench.page.stand_in import CONTROLS, GATE, INSTRUCTORS, TOKEN, VALID
 from cutting_trainer.viewer.access_control import Bucket, PageError, is_local, link, make_gate
 from cutting_trainer.viewer.allowed_requests import ReplayControls
 from cutting_trainer.viewer.live_page import plain
@@ -40,6 +40,11 @@ WRONG: list[Any] = [
     ('choose', {'scene': 'x' * 200_000, 'method': 'delete'}),
     ('choose', {'scene': '', 'method': 'delete'}),
     ('choose', {'scene': 'liver'}),
+    ('hold', {}),
+    ('hold', {'on': 1}),
+    ('tissue', {'stiffness': 1.0}),
+    ('tissue', {'stiffness': 1.0, 'toughness': math.nan}),
+    ('tissue', {'stiffness': 1.0, 'toughness': 0.0}),
     ('scale', {'value': math.nan}),
     ('scale', {'value': math.inf}),
     ('scale', {'value': '1'}),
@@ -70,6 +75,38 @@ def test_each_control_has_one_message_that_is_allowed(op: str) -> None:
     message = parse(said(op, **VALID[op]), 'live')
     assert message.op == op
     assert CONTROLS.refusal(message) == ''
+
+
+@pytest.mark.parametrize('op', INSTRUCTORS)
+def test_what_the_instructor_has_is_refused_to_all_others(op: str) -> None:
+    message = parse(said(op, **INSTRUCTORS[op]), 'live')
+    assert CONTROLS.refusal(message, 'instructor') == ''
+    assert 'instructor' in CONTROLS.refusal(message)
+
+
+def test_what_the_instructor_has_paused_no_trainee_begins_and_every_stop_is_heard() -> None:
+    held = replace(CONTROLS, held=True)
+    for op in ('start', 'reset', 'record', 'choose', 'attempt', 'scale', 'guide'):
+        message = parse(said(op, **VALID[op]), 'live')
+        assert 'instructor' in held.refusal(message)
+        assert bool(held.refusal(message, 'instructor')) == (op in ('start', 'guide'))
+    for op in ('e_stop', 'reset_e_stop', 'pause'):
+        assert held.refusal(parse(said(op), 'live')) == ''
+    going_on = parse(said('hold', on=False), 'live')
+    assert held.refusal(going_on, 'instructor') == '' and held.refusal(going_on)
+
+
+def test_the_instructor_watches_and_moves_no_tool() -> None:
+    message = parse(said('guide', **VALID['guide']), 'live')
+    assert CONTROLS.refusal(message) == ''
+    assert 'watches' in CONTROLS.refusal(message, 'instructor')
+
+
+@pytest.mark.parametrize('factor', [0.4, 2.1])
+def test_a_tissue_that_is_not_on_offer_is_refused(factor: float) -> None:
+    for name in INSTRUCTORS['tissue']:
+        message = parse(said('tissue', **(INSTRUCTORS['tissue'] | {name: factor})), 'live')
+        assert '0.5 to 2' in CONTROLS.refusal(message, 'instructor')
 
 
 @pytest.mark.parametrize(('op', 'fields'), WRONG)
@@ -183,6 +220,18 @@ def test_gate_knows_its_names_its_own_pages_and_its_token(
     host: str, origin: str, path: str, lets_in: bool
 ) -> None:
     assert (GATE.refusal(path, headers(host, origin)) is None) == lets_in
+
+
+def test_each_role_has_a_token_of_its_own() -> None:
+    assert GATE.token != GATE.instructor_token
+    asked = headers('127.0.0.1:8080')
+    for role, own, other in (
+        ('trainee', GATE.token, GATE.instructor_token),
+        ('instructor', GATE.instructor_token, GATE.token),
+    ):
+        assert GATE.refusal(f'/session?token={own}', asked, role) is None  # type: ignore[arg-type]
+        assert GATE.refusal(f'/session?token={other}', asked, role)  # type: ignore[arg-type]
+    assert link('::1', 80, [], 'T', 'instructor') == 'http://[::1]:80/instructor?token=T'
 
 
 def test_gate_refuses_a_request_with_two_hosts() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -65,6 +66,10 @@ def launched(tmp_path: Path) -> Launched:
         '{"ask": "restart", "scene": ["block"]}',
         '{"ask": "restart", "scene": "block", "method": "__class__"}',
         '{"ask": "restart", "method": {"a": 1}}',
+        '{"ask": "restart", "tissue": {"stiffness": 1.5}}',
+        '{"ask": "restart", "tissue": {"stiffness": 9, "toughness": 1}}',
+        '{"ask": "restart", "tissue": {"stiffness": NaN, "toughness": 1}}',
+        '{"ask": "restart", "tissue": [1, 1]}',
         '{"ask": "record"}',
         '{"ask": "record", "on": "yes"}',
         '{"ask": ["restart"]}',
@@ -89,6 +94,42 @@ def test_scene_of_the_list_is_begun_and_said(launched: Launched) -> None:
     assert launched.answers[-1]['scene'] == 'liver'
     launched.line('{"ask": "restart", "method": "delete"}')
     assert launched.answers[-1]['method'] == 'delete'
+    assert not any(answer['problem'] for answer in launched.answers)
+
+
+def test_another_tissue_is_that_of_its_scene_times_factors_in_every_region(
+    launched: Launched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        'cutting_trainer.session.view_command.new_bag', lambda *_: tmp_path / 'bags' / 'pad-1'
+    )
+
+    def of(file: Path) -> tuple[float, ...]:
+        tissue = load_scene(str(file)).tissue
+        (fat,) = tissue.regions
+        skin = tissue.material
+        return skin.youngs_modulus, fat.youngs_modulus or 0, skin.toughness, fat.toughness or 0
+
+    own = np.array(of(load_scene('pad').path))
+    launched.line('{"ask": "attempt", "scene": "pad", "subject": "p-01"}')
+    tissue = {'stiffness': 1.5, 'toughness': 0.5}
+    launched.line(json.dumps({'ask': 'restart', 'tissue': tissue}))
+    file = tmp_path / 'pad-stiffness-1.5-toughness-0.5.yaml'
+    for again in (False, True):
+        *_, nodes, recorder = launched.replaced
+        assert all(str(file) in ' '.join(command.argv) for command in nodes)
+        assert of(file) == pytest.approx(own * [1.5, 1.5, 0.5, 0.5])
+        assert f'scene:="{file}"' in ' '.join(recorder[0].argv)  # of an exercise of its own
+        assert launched.answers[-1]['scene'] == 'pad' and launched.answers[-1]['tissue'] == tissue
+        if not again:
+            launched.line('{"ask": "restart"}')
+    launched.line('{"ask": "attempt", "scene": "pad", "subject": "p-01"}')
+    *_, nodes, recorder = launched.replaced
+    assert not any(str(file) in ' '.join(command.argv) for command in [*nodes, *recorder])
+    assert launched.answers[-1]['tissue'] == {'stiffness': 1.0, 'toughness': 1.0}
+    launched.line(json.dumps({'ask': 'restart', 'tissue': tissue}))
+    launched.line('{"ask": "restart", "scene": "liver", "method": "combined"}')
+    assert launched.answers[-1]['tissue'] == {'stiffness': 1.0, 'toughness': 1.0}
     assert not any(answer['problem'] for answer in launched.answers)
 
 

@@ -44,12 +44,13 @@ from cutting_trainer.session.node_commands import (
 from cutting_trainer.session.node_process import parse_message
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.streaming.messages import packed
-from cutting_trainer.viewer.access_control import TOKEN_VARIABLE
+from cutting_trainer.viewer.access_control import INSTRUCTOR_VARIABLE, TOKEN_VARIABLE
 from cutting_trainer.viewer.diagnostics_table import name_within
 
 pytestmark = pytest.mark.long
 
-TOKEN = 'of-this-test'
+TOKEN, INSTRUCTOR = 'of-this-test', 'of-its-instructor'
+TOKENS = {TOKEN_VARIABLE: TOKEN, INSTRUCTOR_VARIABLE: INSTRUCTOR}
 MAX_LINE = 4096
 """Characters that a line for the launcher may have."""
 
@@ -143,7 +144,7 @@ class Viewer:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env=os.environ | node_environment(domain) | {TOKEN_VARIABLE: TOKEN},
+            env=os.environ | node_environment(domain) | TOKENS,
         )
         self.lines: list[str] = []
         self._thread = threading.Thread(target=self._read, daemon=True)
@@ -158,7 +159,7 @@ class Viewer:
         found = [line.partition(': ')[2] for line in self.lines if line.startswith('message: ')]
         return [parse_message(text) or {} for text in found]
 
-    def answer(self, **content: str) -> None:
+    def answer(self, **content: Any) -> None:
         state = {'scene': 'block', 'method': 'combined', **content}
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(state) + '\n')
@@ -189,12 +190,16 @@ def everything() -> Iterator[tuple[Graph, Viewer, OpenPage]]:
 
 
 def allowed(page: OpenPage, op: str) -> bool:
-    return op not in page.values.get('controls', {'refused': {op: ''}})['refused']
+    return (
+        op
+        not in page.values.get('controls', {'refused': {'trainee': {op: ''}}})['refused']['trainee']
+    )
 
 
 def test_link_has_the_token_of_the_launcher(everything: Any) -> None:
     _, viewer, page = everything
     assert viewer.asked[0]['page'].endswith(f'/?token={TOKEN}')
+    assert viewer.asked[0]['instructor'].endswith(f'/instructor?token={INSTRUCTOR}')
     assert page.values['hello']['camera'] is not None
     assert {'block', 'liver'} <= set(page.values['hello']['scenes'])
 
@@ -217,6 +222,46 @@ def test_e_stop_is_a_topic_of_its_own_and_holds_until_its_reset(everything: Any)
     page.wait(lambda: allowed(page, 'start'), 'the control')
     page.ask('start')
     page.wait(lambda: 'enable' in graph.words[words:], 'the start')
+
+
+def test_the_instructors_pause_holds_against_every_start_until_its_end(everything: Any) -> None:
+    graph, viewer, page = everything
+    instructor = OpenPage(viewer.asked[0]['instructor'])
+    graph.enter('ENABLED')
+    page.wait(lambda: page.values['state']['state'] == 'ENABLED', 'the force')
+    words = len(graph.words)
+    instructor.ask('hold', on=True)
+    page.ask('start')  # in the moment, before its page knows
+    page.wait(lambda: page.values['state']['held'], 'the pause')
+    assert 'The instructor has paused' in page.values['controls']['refused']['trainee']['start']
+    graph.enter('PAUSED')
+    page.wait(lambda: page.values['state']['text'].startswith('The instructor'), 'the reason')
+    page.ask('start')
+    page.ask('e_stop')
+    page.wait(lambda: page.values['state']['e_stopped'], 'the stop')
+    page.ask('reset_e_stop')
+    page.wait(lambda: not page.values['state']['e_stopped'], 'the reset')
+    page.ask('start')
+    page.wait(lambda: page.values.get('refused', {}).get('op') == 'start', 'the refusal')
+    assert page.values['state']['held'] and 'pause' in graph.words[words:]
+    assert not {'enable', 'resume'} & set(graph.words[words:])
+    instructor.ask('hold', on=False)
+    page.wait(lambda: 'enable' in graph.words[words:], 'the force again')
+    page.wait(lambda: not page.values['state']['held'], 'the end of the pause')
+    instructor.close()
+
+
+def test_the_tissue_of_the_instructor_is_a_line_for_the_launcher(everything: Any) -> None:
+    _, viewer, page = everything
+    instructor = OpenPage(viewer.asked[0]['instructor'])
+    instructor.wait(lambda: 'session' in instructor.values, 'the session')
+    tissue = {'stiffness': 1.5, 'toughness': 0.5}
+    assert instructor.values['session']['tissue'] == {'stiffness': 1.0, 'toughness': 1.0}
+    instructor.ask('tissue', **tissue)
+    page.wait(lambda: viewer.asked[-1] == {'ask': 'restart', 'tissue': tissue}, 'the line')
+    viewer.answer(tissue=tissue)
+    instructor.wait(lambda: instructor.values['session']['tissue'] == tissue, 'the answer')
+    instructor.close()
 
 
 def test_hand_is_guided_around_the_tissue_while_the_force_is_on(everything: Any) -> None:

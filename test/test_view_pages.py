@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 from urllib.error import HTTPError
+from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
 import numpy as np
@@ -18,7 +19,7 @@ from bench.common.waiting import until
 from bench.page import fuzz_socket as page_fuzz
 from bench.page import stand_in as page_stand_in
 from bench.page.open_page import OpenPage, session_address
-from bench.page.stand_in import CONTROLS, GATE, VALID, StandIn, sheet, wave
+from bench.page.stand_in import CONTROLS, GATE, INSTRUCTORS, VALID, StandIn, sheet, wave
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
@@ -155,12 +156,26 @@ def test_a_control_does_what_was_asked_for(stand_in: StandIn, page: OpenPage, op
     assert message.model_dump() == {'op': op, **VALID[op]}
 
 
+def test_the_link_decides_what_a_page_may_do(stand_in: StandIn, page: OpenPage) -> None:
+    instructor = OpenPage(stand_in.instructor)
+    for op, fields in INSTRUCTORS.items():
+        assert 'instructor' in refused(page, op, **fields)
+        instructor.ask(op, **fields)
+    assert 'watches' in refused(instructor, 'guide', **VALID['guide'])
+    until(lambda: len(stand_in.asked) == len(INSTRUCTORS), 'the actions')
+    assert {message.op for message in stand_in.asked} == set(INSTRUCTORS)
+    instructor.close()
+    swapped = urlsplit(stand_in.url)._replace(path='/instructor').geturl()
+    with pytest.raises(InvalidStatus, match='403'):
+        OpenPage(swapped)
+
+
 def test_a_control_that_is_off_is_shown_so_and_refused_to_the_one_who_asks(
     stand_in: StandIn, page: OpenPage
 ) -> None:
     other = OpenPage(stand_in.url)
     stand_in.server.allow(LiveControls(busy='The nodes start again ...', session=True))
-    page.wait(lambda: 'reset' in page.values['controls']['refused'], 'the controls')
+    page.wait(lambda: 'reset' in page.values['controls']['refused']['trainee'], 'the controls')
     for op in ('reset', 'record', 'choose', 'guide', 'scale'):
         assert refused(page, op, **VALID[op])
     assert refused(page, 'start', update_cb=[]).startswith('this is not a message')
@@ -361,14 +376,16 @@ def test_page_shows_no_folders_and_follows_what_the_launcher_says(
     live = LivePage(stand_in.server, [ToolSettings()], ExerciseSettings(), CONTROLS)
     problem = 'no scene /home/somebody/x.yaml'
     live.show_session(SessionState('kidney', 'delete', 'bags/kidney-1', problem=problem))
-    live.show_state('FAULT', 'the file /home/somebody/x.yaml is lacking', e_stopped=True)
+    live.show_state(
+        'FAULT', 'the file /home/somebody/x.yaml is lacking', e_stopped=True, held=False
+    )
     page.wait(lambda: 'state' in page.values, 'the state')
     page.wait(lambda: 'session' in page.values, 'the session')
     session = page.values['session']
     assert (session['scene'], session['recording']) == ('kidney', 'kidney-1')
     assert 'somebody' not in str(page.values)
     assert 'kidney' in session['scenes']
-    assert refused(page, 'start') == page.values['controls']['refused']['start']
+    assert refused(page, 'start') == page.values['controls']['refused']['trainee']['start']
 
 
 def test_methods_to_choose_from_are_those_of_the_scene() -> None:

@@ -9,9 +9,13 @@ from ipaddress import ip_address
 from typing import Protocol
 from urllib.parse import parse_qs, urlsplit
 
+from cutting_trainer.viewer.page_protocol import Role
+
 TOKEN_VARIABLE = 'CUTTING_TRAINER_PAGE_TOKEN'
 """Environment variable with the viewer's token, set by the launcher: a restarted viewer keeps its
 token, and its pages reconnect. Other users cannot read it, unlike arguments."""
+INSTRUCTOR_VARIABLE = 'CUTTING_TRAINER_INSTRUCTOR_TOKEN'
+"""The same for the link of the instructor."""
 _LOCAL = frozenset(('localhost', '127.0.0.1', '::1'))
 
 
@@ -84,10 +88,12 @@ class Gate:
     Attributes:
         hosts: names and addresses of this server in requests, without port.
         token: of the link.
+        instructor_token: of the link of the instructor.
     """
 
     hosts: frozenset[str]
     token: str
+    instructor_token: str
 
     def knows(self, headers: Headers) -> bool:
         """Return whether a request has a known name of this server, and comes from its pages."""
@@ -96,24 +102,28 @@ class Gate:
             return False
         return not origins or _is_own(origins[0], hosts[0])
 
-    def refusal(self, path: str, headers: Headers) -> HTTPStatus | None:
+    def refusal(self, path: str, headers: Headers, role: Role = 'trainee') -> HTTPStatus | None:
         """Return why a socket is rejected; None where it is accepted.
 
         A socket needs an `Origin`, which every browser sends, or none, as from a program that is no
-        browser; the token authorises it.
+        browser; the token of its role authorises it.
         """
+        token = self.instructor_token if role == 'instructor' else self.token
         given = _query(path).get('token', [''])
-        right = hmac.compare_digest(given[0].encode(), self.token.encode())
+        right = hmac.compare_digest(given[0].encode(), token.encode())
         return None if right and len(given) == 1 and self.knows(headers) else HTTPStatus.FORBIDDEN
 
 
-def make_gate(host: str, allowed: Collection[str], token: str = '') -> Gate:
+def make_gate(
+    host: str, allowed: Collection[str], token: str = '', instructor_token: str = ''
+) -> Gate:
     """Return the gate of a page.
 
     Args:
         host: listening address.
         allowed: further names and addresses of the server in requests.
         token: of the link; '': a new one.
+        instructor_token: of the link of the instructor; '': a new one.
 
     Raises:
         PageError: other machines can reach it and no name is allowed, or a name is invalid.
@@ -130,13 +140,15 @@ def make_gate(host: str, allowed: Collection[str], token: str = '') -> Gate:
         )
     own = () if host in ('0.0.0.0', '::', '') else (host,)
     names = {name.lower() for name in (*allowed, *own)}
-    return Gate(_LOCAL | names, token or secrets.token_urlsafe(24))
+    made = (given or secrets.token_urlsafe(24) for given in (token, instructor_token))
+    return Gate(_LOCAL | names, *made)
 
 
-def link(host: str, port: int, allowed: Sequence[str], token: str) -> str:
-    """Return the address of a page with its token, by the name that pages use."""
+def link(host: str, port: int, allowed: Sequence[str], token: str, role: Role = 'trainee') -> str:
+    """Return the address of a page of a role with its token, by the name that pages use."""
     name = allowed[0] if allowed else host
-    return f'http://{f"[{name}]" if ":" in name else name}:{port}/?token={token}'
+    page = 'instructor' if role == 'instructor' else ''
+    return f'http://{f"[{name}]" if ":" in name else name}:{port}/{page}?token={token}'
 
 
 def is_local(host: str) -> bool:

@@ -9,13 +9,19 @@ from cutting_trainer.viewer.page_protocol import (
     Choose,
     Guide,
     Record,
+    Role,
     Scale,
     Seek,
+    SetTissue,
     Speed,
     Watch,
 )
 
+TISSUE_FACTORS = (0.5, 2.0)
+"""Range of the factors of the scene's own stiffness and toughness."""
 _NO_LAUNCHER = 'This needs the launcher: the page shows a graph that was started elsewhere.'
+HELD = 'The instructor has paused. Only the instructor goes on.'
+_INSTRUCTORS = 'Only the page of the instructor does this.'
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,7 @@ class LiveControls:
         recording: whether a bag is in progress.
         exercises: titles of the exercises on offer, by scene.
         bags: names of the attempts' bags.
+        held: whether the instructor has paused.
     """
 
     scenes: tuple[str, ...] = ()
@@ -64,11 +71,16 @@ class LiveControls:
     recording: bool = False
     exercises: Mapping[str, str] = field(default_factory=dict)
     bags: tuple[str, ...] = ()
+    held: bool = False
 
-    def refused(self) -> dict[str, str]:
-        """Return why an op is not allowed whatever its values, by op."""
+    def refused(self, role: Role = 'trainee') -> dict[str, str]:
+        """Return why an op is not allowed whatever its values, by op.
+
+        Args:
+            role: of the page.
+        """
         found = {}
-        asks_launcher = ('record', 'choose', 'attempt', 'watch')
+        asks_launcher = ('record', 'choose', 'attempt', 'tissue', 'watch')
         if not self.session:
             found = dict.fromkeys(asks_launcher, _NO_LAUNCHER)
         elif self.busy:
@@ -77,11 +89,18 @@ class LiveControls:
             found['start'] = 'An E-STOP holds: reset it first.'
         if not self.can_guide or self.bounds is None:
             found['guide'] = 'The hand follows only an emulated arm with the force on.'
-        return found
+        if self.held:
+            found['start'] = HELD
+        if role == 'instructor':
+            found['guide'] = 'The trainee moves the tool: this page watches.'
+            return found
+        if self.held:
+            found |= dict.fromkeys(('reset', 'record', 'choose', 'attempt', 'scale', 'guide'), HELD)
+        return found | dict.fromkeys(('hold', 'tissue'), _INSTRUCTORS)
 
-    def refusal(self, message: AnyMessage) -> str:
-        """Return why a message is not allowed now; '' where it is."""
-        if why := self.refused().get(message.op):
+    def refusal(self, message: AnyMessage, role: Role = 'trainee') -> str:
+        """Return why a message from a page of a role is not allowed now; '' where it is."""
+        if why := self.refused(role).get(message.op):
             return why
         if isinstance(message, Choose) and not (
             message.scene in self.scenes and message.method in self.methods
@@ -93,6 +112,12 @@ class LiveControls:
             return 'Choose attempts from the list.'
         if isinstance(message, Scale) and not self.scale[0] <= message.value <= self.scale[1]:
             return f'The force scale is from {self.scale[0]:g} to {self.scale[1]:g}.'
+        if isinstance(message, SetTissue) and not all(
+            TISSUE_FACTORS[0] <= factor <= TISSUE_FACTORS[1]
+            for factor in (message.stiffness, message.toughness)
+        ):
+            low, high = TISSUE_FACTORS
+            return f'Factors of the tissue are from {low:g} to {high:g}.'
         if isinstance(message, Guide) and self.bounds and not self.bounds.contain(message.position):
             return 'The hand is guided around the tissue only.'
         if isinstance(message, Record) and message.on == self.recording:
@@ -112,11 +137,11 @@ class ReplayControls:
     end: float
     speeds: tuple[float, ...]
 
-    def refused(self) -> dict[str, str]:
+    def refused(self, _: Role = 'trainee') -> dict[str, str]:
         """Return an empty dictionary: everything is allowed at any time."""
         return {}
 
-    def refusal(self, message: AnyMessage) -> str:
+    def refusal(self, message: AnyMessage, _: Role = 'trainee') -> str:
         """Return why a message is not allowed; '' where it is."""
         if isinstance(message, Seek) and message.time > self.end:
             return f'The session ends at {self.end:.2f} s.'

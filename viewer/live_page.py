@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -35,6 +35,8 @@ TITLE = 'Cutting trainer'
 METHODS: tuple[str, ...] = get_args(CuttingSettings.model_fields['method'].annotation)
 SCALE = (0.1, 3.0)
 """Range of force scales; a present one beyond it widens the range."""
+OWN_TISSUE: dict[str, float] = {'stiffness': 1.0, 'toughness': 1.0}
+"""Factors of the tissue as its scene has it."""
 PLOT_SPAN_S = 15.0
 """[s] Time span of the plots."""
 _PLOT_PERIOD_S, _TABLE_PERIOD_S = 0.2, 0.5
@@ -77,6 +79,7 @@ class SessionState:
         scene_file: path, where the nodes read another scene from now on; else ''.
         attempts: list of attempts, newest first, where it has changed; else None.
         replay: number and link of the newest replay that was asked for; None: none.
+        tissue: factors of the scene's own stiffness and toughness.
     """
 
     scene: str
@@ -87,6 +90,7 @@ class SessionState:
     scene_file: str = ''
     attempts: list[dict[str, Any]] | None = None
     replay: tuple[int, str] | None = None
+    tissue: dict[str, float] = field(default_factory=lambda: dict(OWN_TISSUE))
 
 
 class LivePage:
@@ -241,13 +245,30 @@ class LivePage:
         )
         self._server.put('plots', span=[-PLOT_SPAN_S, 0.0], lines=lines)
 
-    def show_state(self, state: str, text: str, *, e_stopped: bool) -> None:
-        """Show the operating state, with the last warning beside it."""
+    def show_state(
+        self, state: str, text: str, guided: str = '', *, e_stopped: bool, held: bool
+    ) -> None:
+        """Show the operating state, with the last warning beside it.
+
+        Args:
+            state: of CRTK.
+            text: about it.
+            guided: how the pointer moves the tool.
+            e_stopped: whether an E-STOP holds.
+            held: whether the instructor has paused.
+        """
         if self._now - self._warned > _WARNING_S:
             self._warning = ''
         said = self._busy or ' '.join(filter(None, (text, self._warning)))
-        self._allow(e_stopped=e_stopped)
-        self._server.put('state', state=state, text=plain(said), e_stopped=e_stopped)
+        self._allow(e_stopped=e_stopped, held=held)
+        self._server.put(
+            'state',
+            state=state,
+            text=plain(said),
+            guided='' if self._busy else guided,
+            e_stopped=e_stopped,
+            held=held,
+        )
 
     def warn(self, text: str) -> None:
         """Show a warning for a while."""
@@ -293,6 +314,7 @@ class LivePage:
             recording=recording,
             busy=plain(state.busy),
             scenes=scenes,
+            tissue=state.tissue,
         )
 
 

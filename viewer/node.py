@@ -33,8 +33,14 @@ from cutting_trainer.node_common.timing import PeriodicLoop
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.streaming.mesh_follower import MeshFollower
 from cutting_trainer.tissue_sim.streaming.reset_client import ResetClient
-from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, is_local, link, make_gate
-from cutting_trainer.viewer.allowed_requests import LiveControls
+from cutting_trainer.viewer.access_control import (
+    INSTRUCTOR_VARIABLE,
+    TOKEN_VARIABLE,
+    is_local,
+    link,
+    make_gate,
+)
+from cutting_trainer.viewer.allowed_requests import HELD, LiveControls
 from cutting_trainer.viewer.diagnostics_table import Statuses
 from cutting_trainer.viewer.further_tools import FurtherTool, further_tools
 from cutting_trainer.viewer.live_page import METHODS, LivePage, SessionState
@@ -46,11 +52,13 @@ from cutting_trainer.viewer.page_protocol import (
     Choose,
     EStop,
     Guide,
+    Hold,
     Pause,
     Record,
     Reset,
     ResetEStop,
     Scale,
+    SetTissue,
     Start,
     Watch,
 )
@@ -121,6 +129,7 @@ class ViewerNode(ManagedNode):
             self._calls.put(lambda: self._page.warn(text))
 
         self._operation = Operation(self, warn, tool_names(scene))
+        self._held = False  # by the instructor; set in the server's thread alone
         self._open_page()
         self._resetter = ResetClient(self, warn)
         self._scored = False
@@ -134,15 +143,20 @@ class ViewerNode(ManagedNode):
         port = int(parameter(self, 'port', 8080, text, within=(0, 65535)))
         text = 'names of the page in requests, separated by commas'
         names = [n for n in str(parameter(self, 'allow_host', '', text)).split(',') if n]
-        gate = make_gate(host, names, os.environ.get(TOKEN_VARIABLE, ''))
+        tokens = (os.environ.get(name, '') for name in (TOKEN_VARIABLE, INSTRUCTOR_VARIABLE))
+        gate = make_gate(host, names, *tokens)
         exercises = exercise_titles() if self._launched else {}
         controls = LiveControls(
             tuple(scene_names()), METHODS, session=self._launched, exercises=exercises
         )
         self._server = PageServer(host, port, gate, 'live', controls, self._act)
-        self._link = link(host, self._server.port, names, gate.token)
+        port = self._server.port
+        self._links = {
+            'page': link(host, port, names, gate.token),
+            'instructor': link(host, port, names, gate.instructor_token, 'instructor'),
+        }
         if not is_local(host):
-            self._link += f' {OPEN_LINK_WARNING}'
+            self._links = {of: f'{url} {OPEN_LINK_WARNING}' for of, url in self._links.items()}
         self._page = LivePage(self._server, self._tools, self._exercise, controls)
         self._page.show_scale(self._force_scale)
 
@@ -185,7 +199,7 @@ class ViewerNode(ManagedNode):
         if self._launched and self._listener is None:
             self._listener = threading.Thread(target=self._listen, daemon=True)
             self._listener.start()
-        self._ask_launcher(page=self._link)
+        self._ask_launcher(**self._links)
         announce_ready(self)
         self._loop.start()
         while not stop.is_set():
@@ -224,8 +238,14 @@ class ViewerNode(ManagedNode):
         if self._page.scored and not self._scored:
             self._ask_launcher(ask='finish')
         self._scored = self._page.scored
-        said = self._state_text(now, can_guide=can_guide)
-        self._page.show_state(str(operation.state or ''), said, e_stopped=operation.e_stopped)
+        held = self._held
+        self._page.show_state(
+            str(operation.state or ''),
+            self._state_text(now, held=held),
+            self._guided_text() if can_guide else '',
+            e_stopped=operation.e_stopped,
+            held=held,
+        )
         self._page.show_nodes(now, self._statuses.now(now))
         self._follow_scale()
         self._publish_markers(now, moment)
@@ -262,7 +282,11 @@ class ViewerNode(ManagedNode):
             self._asked.clear()  # an earlier start
         elif isinstance(message, Guide):
             self._operation.guide(message)
+        elif isinstance(message, Start) and self._held:  # before the controls show it
+            self._calls.put(lambda: self._page.warn(HELD))
         else:
+            if isinstance(message, Hold):
+                self._held = message.on
             self._asked.put(message)
 
     def _do(self, message: AnyMessage) -> None:
@@ -271,6 +295,8 @@ class ViewerNode(ManagedNode):
                 self._operation.start()
             case Pause():
                 self._operation.pause()
+            case Hold():
+                self._hold(on=message.on)
             case ResetEStop():
                 self._operation.reset_stop()
             case Reset():
@@ -281,10 +307,20 @@ class ViewerNode(ManagedNode):
                 self._ask_launcher(ask='restart', scene=message.scene, method=message.method)
             case Attempt():
                 self._ask_launcher(ask='attempt', scene=message.scene, subject=message.subject)
+            case SetTissue():
+                tissue = {'stiffness': message.stiffness, 'toughness': message.toughness}
+                self._ask_launcher(ask='restart', tissue=tissue)
             case Watch():
                 self._ask_launcher(ask='watch', bags=message.bags, number=message.number)
             case Scale():
                 self._scale(message.value)
+
+    def _hold(self, *, on: bool) -> None:
+        """Pause, or enable the force again, unless an E-STOP holds."""
+        if on:
+            self._operation.pause()
+        elif not self._operation.e_stopped:
+            self._operation.start()
 
     def _reset(self) -> None:
         """Make the tissue whole; with a bag, the launcher ends it and begins another."""
@@ -333,17 +369,22 @@ class ViewerNode(ManagedNode):
             self._statuses.forget(RECORDER)  # its last status comes after its end
         self._page.show_session(answer)
 
-    def _state_text(self, now: float, *, can_guide: bool) -> str:
+    def _guided_text(self) -> str:
+        """Return how the pointer moves the tool."""
+        deed = 'cut' if self._tools[0].mode == 'scalpel' else 'press'
+        return f'The tool follows the pointer; hold the button to {deed}.'
+
+    def _state_text(self, now: float, *, held: bool) -> str:
         """Return the text for the operating state."""
         bridge, state = self._statuses.said(BRIDGE, now), self._operation.state
         if bridge is None:
             return 'The haptic bridge is silent.'
         if self._operation.e_stopped:
             return 'E-STOP: no force until it is reset, and then Start.'
-        deed = 'cut' if self._tools[0].mode == 'scalpel' else 'press'
-        guided = f'The tool follows the pointer; hold the button to {deed}.' if can_guide else ''
+        if held and state in (CrtkState.PAUSED, CrtkState.DISABLED):
+            return f'{HELD} No force until then.'
         said = {
-            CrtkState.ENABLED: f'Force is on. {guided}',
+            CrtkState.ENABLED: 'Force is on.',
             CrtkState.PAUSED: 'No force. Start goes on.',
             CrtkState.DISABLED: 'No force. Start enables it.',
             CrtkState.FAULT: f'{bridge}. No force until Start.',

@@ -11,10 +11,10 @@ the one before:
 | type | fields |
 |---|---|
 | hello | version, mode, title, session, scenes, methods, exercises of name and title, duration, speeds, tool, further_tools, camera, floor, bounds, metres_per_newton, tissues, plots_span, exercise: null where the scene is none |
-| controls | refused: sentence by op; every other op of the mode is allowed |
-| state | state, text, e_stopped |
+| controls | refused: by role, sentence by op; every other op of the mode is allowed |
+| state | state, text, guided: how the pointer moves the tool, e_stopped, held: by the instructor |
 | nodes | rows of name, level, message, rate |
-| session | scene, method, recording, busy, scenes |
+| session | scene, method, recording, busy, scenes, tissue: factors stiffness and toughness |
 | scale | value, min, max |
 | moment | tip, wxyz, proxy, force, depth, can_guide, contact, clutched, further: tip and wxyz of each further tool, null where it is not known |
 | plots | span, lines of title, unit, times, values and colours by name, least |
@@ -35,7 +35,7 @@ the tissue. Null triangles mean that the page has them already.
 """  # noqa: E501
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -54,6 +54,9 @@ Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME)]
 Coordinate = Annotated[float, Field(ge=-_MAX_COORDINATE_M, le=_MAX_COORDINATE_M)]
 Share = Annotated[float, Field(ge=-1 - _LENGTH_TOLERANCE, le=1 + _LENGTH_TOLERANCE)]
 Positive = Annotated[float, Field(gt=0, le=1000)]
+Role = Literal['trainee', 'instructor']
+"""Of a page: who looks at it, by its link."""
+ROLES: tuple[Role, ...] = get_args(Role)
 
 
 class PageMessage(BaseModel):
@@ -115,6 +118,21 @@ class Attempt(PageMessage):
     subject: Annotated[str, Field(max_length=MAX_NAME, pattern=r'^[A-Za-z0-9_.-]*$')]
 
 
+class Hold(PageMessage):
+    """Pause for everybody until the same with `on` false, which enables the force again."""
+
+    op: Literal['hold']
+    on: bool
+
+
+class SetTissue(PageMessage):
+    """Restart the nodes with another tissue: factors of the scene's own values."""
+
+    op: Literal['tissue']
+    stiffness: Positive
+    toughness: Positive
+
+
 class Watch(PageMessage):
     """Serve the replay of an attempt, or of two side by side; the answer has the same number."""
 
@@ -172,8 +190,8 @@ class Speed(PageMessage):
 
 
 LiveMessage = (
-    EStop | ResetEStop | Start | Pause | Reset | Record | Choose | Attempt | Watch | Scale | Guide
-    | Ping
+    EStop | ResetEStop | Start | Pause | Reset | Record | Choose | Attempt | Hold | SetTissue
+    | Watch | Scale | Guide | Ping
 )  # fmt: skip
 ReplayMessage = Play | Seek | Speed | Ping
 AnyMessage = LiveMessage | ReplayMessage

@@ -26,17 +26,20 @@ from cutting_trainer.viewer.access_control import Bucket, Gate, PageError, PageL
 from cutting_trainer.viewer.allowed_requests import Controls
 from cutting_trainer.viewer.page_protocol import (
     MAX_MESSAGE,
+    ROLES,
     AnyMessage,
     EStop,
     Mode,
     Ping,
     ProtocolError,
+    Role,
     parse,
 )
 from cutting_trainer.viewer.page_state import PageState, ReceivedVersions, TissueFrame
 from cutting_trainer.viewer.static_files import answer, read_files
 
-SESSION = '/session'
+SESSIONS: dict[str, Role] = {'/session': 'trainee', '/instructor/session': 'instructor'}
+"""Roles by the path of the socket."""
 _CHUNK = 4096
 """[bytes] read of one socket before the others are served."""
 _KEEPALIVE_S, _CLOSING_S, _OPENING_S = 10.0, 1.0, 5.0
@@ -83,10 +86,11 @@ class _Page:
     Args:
         connection: its socket.
         limits: of its messages.
+        role: of who looks at it.
     """
 
-    def __init__(self, connection: ServerConnection, limits: PageLimits) -> None:
-        self.connection = connection
+    def __init__(self, connection: ServerConnection, limits: PageLimits, role: Role) -> None:
+        self.connection, self.role = connection, role
         self.seen = ReceivedVersions()
         self.news = asyncio.Event()
         self.news.set()
@@ -170,7 +174,7 @@ class PageServer:
     def allow(self, controls: Controls) -> None:
         """Set the allowed requests, and publish them to the pages."""
         self._controls = controls
-        self.put('controls', refused=controls.refused())
+        self.put('controls', refused={role: controls.refused(role) for role in ROLES})
 
     def stop(self) -> None:
         """Close all pages and the server."""
@@ -222,11 +226,12 @@ class PageServer:
             return answer(HTTPStatus.FORBIDDEN, 'localhost')
         host = request.headers['Host']
         path = urlsplit(request.path).path
-        if path != SESSION:
+        role = SESSIONS.get(path)
+        if role is None:
             content = self._files.get(path)
             status = HTTPStatus.OK if content else HTTPStatus.NOT_FOUND
             return answer(status, host, content)
-        if why := self._gate.refusal(request.path, request.headers):
+        if why := self._gate.refusal(request.path, request.headers, role):
             return answer(why, host)
         if not self._openings.take(1.0, time.monotonic()):
             return answer(HTTPStatus.SERVICE_UNAVAILABLE, host)
@@ -236,7 +241,9 @@ class PageServer:
         if len(self._pages) >= self.limits.pages:
             await connection.close(1013, _FULL)
             return
-        page = _Page(connection, self.limits)
+        assert connection.request is not None
+        role = SESSIONS[urlsplit(connection.request.path).path]
+        page = _Page(connection, self.limits, role)
         self._pages.add(page)
         sender = asyncio.create_task(self._send_updates(page))
         try:
@@ -289,7 +296,7 @@ class PageServer:
         if isinstance(message, Ping):
             page.reply('pong', id=message.id, age=round(time.monotonic() - self._ticked, 3))
             return
-        why = '' if isinstance(message, EStop) else self._controls.refusal(message)
+        why = '' if isinstance(message, EStop) else self._controls.refusal(message, page.role)
         if why:
             page.reply('refused', op=message.op, why=why)
             return

@@ -39,7 +39,7 @@ def read_files(folder: Path = FOLDER) -> dict[str, tuple[str, bytes]]:
         if path.is_file() and path.suffix in _TYPES
     }
     if '/static/index.html' in files:
-        files['/'] = files['/static/index.html']
+        files['/'] = files['/instructor'] = files['/static/index.html']
     return files
 
 

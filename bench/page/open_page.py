@@ -28,7 +28,7 @@ STEP_TIMEOUT_S = 30.0
 def session_address(url: str) -> str:
     """Return the address of the socket of a page's link."""
     parts = urlsplit(url)
-    return f'ws://{parts.netloc}/session?{parts.query}'
+    return f'ws://{parts.netloc}{parts.path.rstrip("/")}/session?{parts.query}'
 
 
 class OpenPage:

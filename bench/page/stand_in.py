@@ -55,6 +55,11 @@ VALID: dict[str, dict[str, Any]] = {
     'guide': {'position': HERE, 'wxyz': (1.0, 0.0, 0.0, 0.0)},
 }
 """One valid message of each control of a live page."""
+INSTRUCTORS: dict[str, dict[str, Any]] = {
+    'hold': {'on': True},
+    'tissue': {'stiffness': 1.5, 'toughness': 0.5},
+}
+"""The same of those that only the page of an instructor has."""
 
 
 class StandIn:
@@ -70,7 +75,9 @@ class StandIn:
         self.counts: Counter[str] = Counter()
         self.stopped: deque[float] = deque(maxlen=1000)
         self.server = PageServer('127.0.0.1', 0, GATE, 'live', controls, self._act, limits)
-        self.url = link('127.0.0.1', self.server.port, [], TOKEN)
+        port = self.server.port
+        self.url = link('127.0.0.1', port, [], TOKEN)
+        self.instructor = link('127.0.0.1', port, [], GATE.instructor_token, 'instructor')
 
     def _act(self, message: AnyMessage) -> None:
         if isinstance(message, EStop):

@@ -10,8 +10,8 @@ const OLD_LINK =
   'There is no connection. The picture is old. If the trainer was started anew, this link is an old one: open the one that it printed.';
 
 /** Address of the socket: beside the page, with the page's token. */
-function address() {
-  const url = new URL('session', location.href);
+function address(path) {
+  const url = new URL(path, location.href);
   url.protocol = location.protocol === 'https:' ? 'wss:' : 'ws:';
   const token = new URLSearchParams(location.search).get('token');
   url.search = token === null ? '' : `?${new URLSearchParams({ token })}`;
@@ -23,8 +23,10 @@ export class Connection {
   /**
    * @param {object} take handlers of a message: text(object), binary(ArrayBuffer)
    * @param {function} changed called after each change of `status` or `age`
+   * @param {string} path of the socket, beside the page
    */
-  constructor(take, changed) {
+  constructor(take, changed, path) {
+    this._path = path;
     this.status = 'connecting';
     this.reason = '';
     this.stale = false;
@@ -47,7 +49,7 @@ export class Connection {
   open() {
     this._timer = null;
     this._heard = this._news = performance.now();
-    const socket = new WebSocket(address());
+    const socket = new WebSocket(address(this._path));
     socket.binaryType = 'arraybuffer';
     this._socket = socket;
     socket.onopen = () => {

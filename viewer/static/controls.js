@@ -2,6 +2,7 @@
 
 import { fill } from './fill.js';
 import { Gauge } from './gauge.js';
+import { isInstructor } from './role.js';
 
 const STATES = {
   ENABLED: ['▶', 'FORCE ON'], PAUSED: ['❚❚', 'PAUSED'], DISABLED: ['○', 'FORCE OFF'], FAULT: ['▲', 'FAULT'],
@@ -9,6 +10,7 @@ const STATES = {
 const LEVELS = [['●', 'ok'], ['▲', 'warning'], ['✕', 'error'], ['?', 'silent']];
 const SCALE_MS = 100;
 const FULL_FORCE = 5, FULL_DEPTH = 20; // [N], [mm] of the gauges without an exercise
+const FACTORS = ['stiffness', 'toughness'];
 const CONTACTS = ['free', 'touching', 'inside'];
 
 const $ = (id) => document.getElementById(id);
@@ -20,15 +22,22 @@ export class Controls {
     this.refused = {};
     this.connected = false;
     this.session = { scene: '', method: '', recording: '', busy: '', scenes: [] };
-    this.state = { state: '', text: '', e_stopped: false };
+    this.state = { state: '', text: '', guided: '', e_stopped: false, held: false };
     this._lastScale = 0;
     [this._forceGauge, this._depthGauge] = ['force', 'depth'].map((name) => new Gauge($(`${name}-gauge`)));
-    for (const op of ['start', 'pause', 'reset']) $(op).addEventListener('click', () => send({ op }));
+    $('start').addEventListener('click', () => send(this._lifts ? { op: 'hold', on: false } : { op: 'start' }));
+    $('pause').addEventListener('click', () => send(isInstructor ? { op: 'hold', on: true } : { op: 'pause' }));
+    $('reset').addEventListener('click', () => send({ op: 'reset' }));
+    $('set-tissue').hidden = !isInstructor;
+    $('tissue').addEventListener('click', () => {
+      send({ op: 'tissue', ...Object.fromEntries(FACTORS.map((name) => [name, Number($(name).value)])) });
+    });
+    for (const name of FACTORS) $(name).addEventListener('input', () => showFactor(name));
     $('record').addEventListener('click', () => send({ op: 'record', on: !this.session.recording }));
     for (const id of ['scene', 'method']) $(id).addEventListener('change', () => this._choose());
     $('scale').addEventListener('input', () => this._scale(false));
     $('scale').addEventListener('change', () => this._scale(true));
-    this._hints = Object.fromEntries(['start', 'pause', 'reset', 'record', 'begin'].map((id) => [id, $(id).title]));
+    this._hints = Object.fromEntries(['start', 'pause', 'reset', 'record', 'begin', 'tissue'].map((id) => [id, $(id).title]));
   }
 
   begin(hello) {
@@ -50,14 +59,30 @@ export class Controls {
 
   showState(state) {
     this.state = state;
-    const [sign, name] = state.e_stopped ? ['■', 'E-STOP'] : STATES[state.state] ?? ['…', 'WAITING'];
-    $('state').dataset.state = state.e_stopped ? 'E_STOP' : state.state;
+    const shown = state.held && state.state === 'DISABLED' ? 'PAUSED' : state.state;
+    const [sign, name] = state.e_stopped ? ['■', 'E-STOP'] : STATES[shown] ?? ['…', 'WAITING'];
+    $('state').dataset.state = state.e_stopped ? 'E_STOP' : shown;
     $('state-name').textContent = `${sign} ${name}`;
-    $('state-text').textContent = state.text || (state.state ? '' : 'Waiting for the haptic bridge.');
+    const text = isInstructor ? state.text : [state.text, state.guided].join(' ').trim();
+    $('state-text').textContent = text || (state.state ? '' : 'Waiting for the haptic bridge.');
+    $('start').textContent = this._lifts ? 'Go on' : 'Start';
     this.enable();
   }
 
+  // The instructor's own pause is lifted by the page of an instructor alone.
+  get _lifts() {
+    return isInstructor && this.state.held;
+  }
+
   showSession(session) {
+    const { stiffness, toughness } = this.session.tissue ?? {};
+    const { tissue } = session;
+    if (tissue && (tissue.stiffness !== stiffness || tissue.toughness !== toughness)) {
+      for (const name of FACTORS) {
+        $(name).value = tissue[name];
+        showFactor(name);
+      }
+    }
     this.session = session;
     const scenes = session.scenes?.length ? session.scenes : this._scenes ?? [];
     fill($('scene'), scenes.includes(session.scene) || !session.scene ? scenes : [...scenes, session.scene]);
@@ -116,15 +141,18 @@ export class Controls {
       $(id).disabled = Boolean(reason);
       $(id).title = reason || this._hints[id] || '';
     };
-    const { state } = this.state;
-    stand('start', 'start', state === 'ENABLED' ? 'The force is on.' : '');
-    stand('pause', 'pause', state === 'PAUSED' ? 'It is paused.' : '');
+    const { state, held } = this.state;
+    if (this._lifts) stand('start', 'hold', this.state.e_stopped ? 'An E-STOP holds: reset it first.' : '');
+    else stand('start', 'start', state === 'ENABLED' ? 'The force is on.' : '');
+    if (isInstructor) stand('pause', 'hold', held ? 'You have paused.' : '');
+    else stand('pause', 'pause', state === 'PAUSED' ? 'It is paused.' : '');
     stand('reset', 'reset');
     stand('record', 'record');
     stand('scene', 'choose');
     stand('method', 'choose');
     stand('begin', 'attempt');
     stand('scale', 'scale');
+    for (const id of ['tissue', ...FACTORS]) stand(id, 'tissue');
   }
 
   _choose() {
@@ -142,6 +170,10 @@ export class Controls {
     this._lastScale = now;
     this._send({ op: 'scale', value: Number($('scale').value) });
   }
+}
+
+function showFactor(name) {
+  $(`${name}-value`).textContent = Number($(name).value).toFixed(1);
 }
 
 function newRow(body) {

@@ -9,9 +9,10 @@ const NOTCH = 0.0005; // [m] of the wheel
 const STEP = 0.0005, LONG_STEP = 0.002; // [m] of a key, with Shift
 const ROTATION_STEP = Math.PI / 60; // of a key
 const DOWN = 0.04, UP = 0.15, STROKE = 0.12; // [m/s] of the goal: down, up, along a cut
-const MAX_PUSH = 0.016; // [m] beyond the depth, until the blade goes in: hand and tissue yield
+const PUSH_STEP = (DOWN * PERIOD_MS) / 1000, MAX_PUSH = 0.016; // [m] beyond the depth, until the blade goes in: hand and tissue yield
 const NEAR = 0.005; // [m] beside the place of a cut from where the blade goes down
 const FAR = 0.012, MAX_LIFT = 0.02; // [m] of a way from which the blade is lifted over the tissue
+const BELOW_END = 0.002; // [m] that such a lift stays below the end of an exercise
 const TURN = 4; // [rad/s] of the edge to the direction of a cut
 const HEADING = 0.003; // [m] of a cut that make its direction
 const MIN_SHARE = 0.1; // of the speed, while the edge does not face the stroke
@@ -47,6 +48,7 @@ export class Guide {
     this.follows = true;
     this.byView = true; // whether right and ahead are those of the view, or of the tissue's axes
     this.height = HEIGHT;
+    this.ceiling = Infinity;
     this.depth = DEPTH;
     this._cuts = new Set(); // what holds the cut
     this._finger = null;
@@ -253,6 +255,12 @@ export class Guide {
     else this.turn(turn[0], turn[1] * ROTATION_STEP);
   }
 
+  /** No lift on the way ends an attempt: the tip is back at the end of an exercise by a hand alone. */
+  begin({ bounds, exercise }) {
+    this.bounds = bounds ?? null;
+    this.ceiling = exercise?.end ? exercise.end.centre[2] - exercise.end.radius - BELOW_END : Infinity;
+  }
+
   // From the aim to the goal
 
   _aimAt(hit) {
@@ -282,11 +290,10 @@ export class Guide {
     }
     const end = new Vector3().fromArray(moment.tip).add(this._toEnd());
     const way = Math.hypot(end.x - this._aim.point.x, end.y - this._aim.point.y);
-    const sinks = this._down(dt, way, moment.contact === INSIDE);
+    const sinks = this._down(dt, way, moment);
     const moves = this._along(dt) || sinks || way > FAR;
-    const lift = this.cutting ? 0 : clamp(way - FAR, [0, MAX_LIFT]);
-    this.goal.position.copy(this._aim.point).addScaledVector(this._aim.normal, this._level)
-      .addScaledVector(Z, lift).sub(this._toEnd());
+    const goal = this.goal.position.copy(this._aim.point).addScaledVector(this._aim.normal, this._level).sub(this._toEnd());
+    if (!this.cutting) goal.z += clamp(Math.min(way - FAR, this.ceiling - goal.z), [0, MAX_LIFT]);
     this._bound(this.goal.position);
     this._say();
     this.show();
@@ -294,15 +301,18 @@ export class Guide {
   }
 
   /** Moves the level to that of the cut, or of the height; returns whether it goes on. */
-  _down(dt, way, inside) {
+  _down(dt, way, moment) {
     if (this.cutting && way > NEAR && this._level > 0 && this._push === 0) return true; // not there yet
     const wanted = this.cutting ? -this.depth - this._push : this.height;
     const step = clamp(wanted - this._level, [-DOWN * dt, UP * dt]);
     this._level += step;
     if (!this.cutting) return Math.abs(wanted - this._level) > 1e-6;
-    this._entered ||= inside;
+    this._entered ||= moment.contact === INSIDE;
+    // A step for each moment, which says whether the blade is in: where they come late it is pushed slower.
+    const news = moment !== this._seen;
+    this._seen = moment;
     if (this._entered || !this._stage.tool.cuts) this._push = 0;
-    else if (this._level - wanted < 1e-9) this._push = clamp(this._push + DOWN * dt, [0, MAX_PUSH]);
+    else if (news && this._level - wanted < 1e-9) this._push = clamp(this._push + PUSH_STEP, [0, MAX_PUSH]);
     return true;
   }
 

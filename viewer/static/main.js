@@ -6,6 +6,7 @@ import { Gamepad } from './gamepad.js';
 import { decodeMesh } from './mesh.js';
 import { Notices } from './notices.js';
 import { Plots } from './plots.js';
+import { isInstructor, role, socketPath } from './role.js';
 import { Stop } from './stop.js';
 import { Task } from './task.js';
 import { TimeLine } from './timeline.js';
@@ -21,7 +22,7 @@ let canGuide = false;
 let waiting = []; // for the stage, while it is being loaded
 
 const notices = new Notices($('notices'));
-const connection = new Connection({ text: take, binary: takeBinary }, showConnection);
+const connection = new Connection({ text: take, binary: takeBinary }, showConnection, socketPath);
 const send = (message) => {
   if (!connection.send(message)) notices.say('There is no connection: nothing was sent.', 'bad');
 };
@@ -36,7 +37,7 @@ let plots = new Plots($('plots'), null);
 const takers = {
   hello: begin,
   controls: ({ refused }) => {
-    controls.refused = refused;
+    controls.refused = refused[role];
     controls.enable();
     allowGuide();
   },
@@ -121,7 +122,7 @@ function begin(hello) {
   $('training').hidden = !hello.session;
   onStage(() => {
     stage.begin(hello);
-    guide.bounds = hello.bounds ?? null;
+    guide.begin(hello);
     showGuide();
   });
 }
@@ -153,6 +154,7 @@ function showConnection() {
     said = `No news from the session for ${(age / 1000).toFixed(0)} s. The picture is old.`;
   }
   document.body.classList.toggle('old', said !== '');
+  if (said === '' && controls.state.held && !isInstructor) said = 'The instructor has paused.';
   $('banner').hidden = said === '';
   if ($('banner').textContent !== said) $('banner').textContent = said;
 }
@@ -246,6 +248,7 @@ function snapshot() {
     state: controls.state.state,
     text: controls.state.text,
     eStopped: controls.state.e_stopped,
+    held: controls.state.held,
     ...controls.session,
     canGuide: guide?.allowed ?? false,
     cutting: guide?.cutting ?? false,
@@ -268,7 +271,7 @@ function snapshot() {
   };
 }
 
-/** For tests: the state of the page, and the window position of a point of the tissue frame. */
+/** For tests and films: the state of the page, the window position of a point of the tissue frame, and the camera. */
 Object.defineProperty(window, 'page', {
   value: Object.freeze({
     get state() {
@@ -278,8 +281,15 @@ Object.defineProperty(window, 'page', {
       const { x, y } = stage.project({ x: point[0], y: point[1], z: point[2] });
       return [x, y];
     },
+    zoom(factor) {
+      stage.zoom(factor);
+    },
   }),
 });
 
+if (isInstructor) {
+  document.title = $('name').textContent = `${document.title}: instructor`;
+  $('view').setAttribute('aria-label', 'Tissue and tool in three dimensions');
+}
 openStage();
 connection.open();

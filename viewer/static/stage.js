@@ -168,6 +168,14 @@ export class Stage {
     this.invalidate();
   }
 
+  /** Brings the camera nearer to its target by a factor. */
+  zoom(factor) {
+    const { target } = this.controls;
+    this.camera.position.sub(target).divideScalar(factor).add(target);
+    this.controls.update();
+    this.invalidate();
+  }
+
   takeMesh(mesh) {
     const tissue = this._tissue(mesh.name);
     const fresh = tissue.first === null;
