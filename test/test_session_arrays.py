@@ -78,7 +78,7 @@ def test_the_program_of_the_documentation_builds_a_state_of_a_session(
     tissue = tissue_at(open_bag(bag.path), time + 1e-6)
     assert np.array_equal(names['places'], tissue.positions())
     assert np.array_equal(names['tetrahedra'], tissue.tetrahedra)
-    assert names['block'] > 10, 'after cuts'
+    assert names['block'] > 0, 'after cuts'
 
 
 def test_the_file_says_units_licence_and_the_hash_of_the_tissue(tmp_path: Path) -> None:

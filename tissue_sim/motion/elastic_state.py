@@ -58,10 +58,11 @@ class ElasticState:
         self._force, self._products = grown(self._force, n), grown(self._products, n)
         if len(self._scratch) < 3 * n:
             self._scratch = np.zeros(len(self._force) * 3)
-        level = model.neighbours.levels(moved, 3)
-        near = np.flatnonzero(level <= 1)
+        reach = 1 if model.smoothing is None else 2  # a domain has its node's neighbours
+        level = model.neighbours.levels(moved, reach + 2)
+        near = np.flatnonzero(level <= reach)
         f = self._scratch[: 3 * n]
-        internal_force(model.operands_within(level, 1), u.reshape(-1), f, 1)
+        internal_force(model.operands_within(level, reach), u.reshape(-1), f, 1)
         self._force[near] = f.reshape(-1, 3)[near]
         self._products[near] = np.einsum('ij,ij->i', u[near], self._force[near])
         work = 0.5 * float(self._products[:n].sum())
