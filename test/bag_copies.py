@@ -1,5 +1,6 @@
 """Copies of bags in which something is otherwise, and the processor that computed a bag."""
 
+import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -19,6 +20,16 @@ def is_of_this_processor(folder: Path) -> bool:
     """
     code = identity_of(open_bag(folder).custom_data)
     return code is not None and code.is_of_processor_of(identity_here())
+
+
+def copies_by_subjects(source: Path, folder: Path, *subjects: str) -> None:
+    """Copies of a bag by other subjects, in folders a, b, and so on; each has its own hash."""
+    for name, subject in zip('abcdefgh', subjects, strict=False):
+        shutil.copytree(source, folder / name)
+        file = folder / name / 'metadata.yaml'
+        text = file.read_text().replace('custom_data:', f'custom_data:\n    subject: {subject}', 1)
+        file.write_text(f'{text}\n# {name}\n')
+        assert open_bag(folder / name).custom_data['subject'] == subject
 
 
 def rewritten(

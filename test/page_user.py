@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -23,7 +24,7 @@ def sessions() -> set[Path]:
 
 
 class View:
-    """`trainer view` as a process of its own."""
+    """`trainer view` as a process of its own; `with` ends it, and prints what it said."""
 
     def __init__(self, folder: Path, scene: Path) -> None:
         self._said = folder / 'said'
@@ -38,6 +39,14 @@ class View:
                 env=os.environ | {'COLUMNS': '200'},
                 start_new_session=True,
             )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        print(self.said)
+        if self.process.poll() is None:
+            self.end()
 
     def url(self, whose: str = 'page') -> str:
         """Where the page is, or that of the `instructor`, once all nodes are ready."""

@@ -83,8 +83,8 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     try:
         for ending in ('died', 'ended'):
             folder = tmp_path_factory.mktemp(ending)
-            view = View(folder, write_scene(folder, two_presses(), 20.0, cut_threshold=0.2))
-            try:
+            scene = write_scene(folder, two_presses(), 20.0, cut_threshold=0.2)
+            with View(folder, scene) as view:
                 page = OpenPage(view.url())
                 begin(page)
                 if ending == 'died':
@@ -92,10 +92,6 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
                 else:
                     found['status'] = view.end()
                 page.close()
-            finally:
-                print(view.said)
-                if view.process.poll() is None:
-                    view.end()
             found[ending] = attempts()
         yield found
     finally:

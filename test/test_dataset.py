@@ -1,16 +1,15 @@
 """Data sets for learning: the files of LeRobot's format, and their agreement with the bags."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from bag_copies import copies_by_subjects
 
 from bench.files.lerobot_loader import differences, figures_of
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies.bag_collection import StudyBag, find_bags
 from cutting_trainer.studies.dataset import EPISODES_FILE, INFO_FILE, write_dataset
@@ -56,12 +55,7 @@ def test_an_export_that_fails_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_subjects_are_numbered_and_their_names_stay_out(tmp_path: Path) -> None:
-    for name, subject in (('a', 'Ann Doe'), ('b', 'Bob'), ('c', 'Ann Doe')):
-        shutil.copytree(SAMPLES / 'palpation', tmp_path / 'bags' / name)
-        file = tmp_path / 'bags' / name / 'metadata.yaml'
-        text = file.read_text().replace('custom_data:', f'custom_data:\n    subject: {subject}', 1)
-        file.write_text(f'{text}\n# {name}\n')
-        assert open_bag(tmp_path / 'bags' / name).custom_data['subject'] == subject
+    copies_by_subjects(SAMPLES / 'palpation', tmp_path / 'bags', 'Ann Doe', 'Bob', 'Ann Doe')
     write_dataset(find_bags(['bags'], tmp_path), tmp_path / 'set', '')
     about = json.loads((tmp_path / 'set' / EPISODES_FILE).read_text())
     assert [of['subject'] for of in about] == ['subject-1', 'subject-2', 'subject-1']

@@ -155,6 +155,16 @@ def on_top(stand_in: StandIn, x: float, y: float) -> np.ndarray:
     return np.array([x, y, stand_in.positions[:, 2].max()])
 
 
+def hovering(page: Page, stand_in: StandIn) -> tuple[np.ndarray, Any, Any]:
+    """Lets the blade come over the middle of the block: the place [m], and its x and y [pixel]."""
+    guided(page)
+    top = on_top(stand_in, 0.0, 0.0)
+    x, y = page.pixels(top[None])[0]
+    page.mouse('mouseMoved', x, y)
+    stand_in.wait(lambda: stand_in.of(Guide))
+    return top, x, y
+
+
 def end_of_blade(goal: Guide) -> np.ndarray:
     """Where the blade ends at a goal [m]: it is upright."""
     return np.array(goal.position) - [0.0, 0.0, 0.004]
@@ -257,11 +267,7 @@ def test_the_blade_is_pushed_no_deeper_than_moments_say_that_it_is_not_in(
 ) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:
-        guided(page)
-        top = on_top(stand_in, 0.0, 0.0)
-        x, y = page.pixels(top[None])[0]
-        page.mouse('mouseMoved', x, y)
-        stand_in.wait(lambda: stand_in.of(Guide))
+        top, x, y = hovering(page, stand_in)
         page.mouse('mousePressed', x, y, pressed=True)
 
         def depth() -> float:
@@ -295,11 +301,7 @@ def test_a_lift_on_a_long_way_ends_no_attempt(browser: Browser) -> None:
 def test_wheel_keys_and_the_button_that_stays_set_depth_and_cut(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:
-        guided(page)
-        top = on_top(stand_in, 0.0, 0.0)
-        x, y = page.pixels(top[None])[0]
-        page.mouse('mouseMoved', x, y)
-        stand_in.wait(lambda: stand_in.of(Guide))
+        top, x, y = hovering(page, stand_in)
         page.evaluate("document.querySelector('#view').focus()")
         page.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0, deltaY=120)
         page.wait(lambda: page.says('Height 3.5 mm'), 'the wheel')

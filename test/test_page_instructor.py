@@ -128,8 +128,7 @@ def press_in(page: Page) -> float:
 def lesson(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """A lesson on a real graph: pressed, paused, gone on, and pressed in a stiffer tissue."""
     folder, known, found = tmp_path_factory.mktemp('lesson'), sessions(), {}
-    view = View(folder, load_scene('lumps').path)
-    try:
+    with View(folder, load_scene('lumps').path) as view:
         url, instructors = view.url(), view.url('instructor')
         with both(url, instructors) as (trainee, instructor):
             found['soft'] = press_in(trainee)
@@ -164,10 +163,6 @@ def lesson(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]
             instructor.press('e-stop')
             trainee.wait(lambda: trainee.state()['eStopped'], 'the stop')
         found['status'] = view.end()
-    finally:
-        print(view.said)
-        if view.process.poll() is None:
-            view.end()
     yield found
     for bag in sessions() - known:
         shutil.rmtree(bag)

@@ -78,16 +78,11 @@ def use(page: Page, known: set[Path]) -> tuple[Path, Any, Any]:
 @pytest.fixture(scope='module')
 def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Made]:
     folder, known = tmp_path_factory.mktemp('page'), sessions()
-    view = View(folder, write_scene(folder, two_presses(), 20.0, cut_threshold=0.2))
-    try:
+    with View(folder, write_scene(folder, two_presses(), 20.0, cut_threshold=0.2)) as view:
         url = view.url()
         with chromium((1000, 700), coarseness=2) as browser:
             bag, before, after = use(browser.page(url), known)
         made = Made(bag, before, after, view.end())
-    finally:
-        print(view.said)
-        if view.process.poll() is None:
-            view.end()
     yield made
     for bag in sessions() - known:
         shutil.rmtree(bag)

@@ -36,9 +36,8 @@ ATTEMPTS = ('good', 'bad')
 def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """Two attempts at each exercise here; what the page says, lists, and shows of two of them."""
     folder, known = tmp_path_factory.mktemp('training'), sessions()
-    view = View(folder, write_scene(folder, two_presses(), 20.0, cut_threshold=0.2))
     found: dict[str, Any] = {}
-    try:
+    with View(folder, write_scene(folder, two_presses(), 20.0, cut_threshold=0.2)) as view:
         url = view.url()
         with chromium((1280, 800), coarseness=2) as browser:
             page = browser.page(url)
@@ -54,10 +53,6 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
             page.press('e-stop')
             page.wait(lambda: page.state()['eStopped'], 'the stop, beside a replay')
         found['status'] = view.end()
-    finally:
-        print(view.said)
-        if view.process.poll() is None:
-            view.end()
     yield found
     trainer('attempts', '--delete', SUBJECT)
     for bag in sessions() - known:

@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from bag_copies import copies_by_subjects
 
 from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import Bag, Recorded, open_bag
@@ -125,11 +126,7 @@ def test_units_are_those_of_the_message_definitions() -> None:
 
 
 def test_subjects_have_numbers_and_their_names_stay_out(tmp_path: Path) -> None:
-    for name, subject in (('a', 'Ann Doe'), ('b', 'Bob'), ('c', 'Ann Doe')):
-        shutil.copytree(SAMPLES / 'palpation', tmp_path / 'bags' / name)
-        file = tmp_path / 'bags' / name / 'metadata.yaml'
-        text = file.read_text().replace('custom_data:', f'custom_data:\n    subject: {subject}', 1)
-        file.write_text(f'{text}\n# {name}\n')
+    copies_by_subjects(SAMPLES / 'palpation', tmp_path / 'bags', 'Ann Doe', 'Bob', 'Ann Doe')
     write_sessions(find_bags(['bags'], tmp_path), tmp_path / 'set.h5', '')
     with h5py.File(tmp_path / 'set.h5') as file:
         subjects = [session.attrs['subject'] for session in file['sessions'].values()]

@@ -5,17 +5,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from meshes import box, irregular_box
-from scipy.sparse.linalg import LinearOperator, eigsh
 from strokes import method_named, straight
 
+from bench.cuts.comparison import highest_frequency
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling, springs_of
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import (
-    ElasticModel,
-    ModelName,
-    stiffness_product,
-)
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
 from cutting_trainer.tissue_sim.motion.integrators import Integrator
@@ -101,23 +97,10 @@ def test_no_mode_is_faster_than_the_bound_at_any_time_of_a_cut(
         for a, b in pairwise(straight(*ends, (0.0, 0.001, 0.02), 6)):
             cut = method.advance(tissue.mesh, tissue.mesh.rest, Sweep(*a, *b))
             tissue.apply_cut(cut.delta)
-            ratios.append(highest_frequency(tissue) / tissue._frequency.omega)
+            highest = highest_frequency(tissue.model, tissue.inverse_mass)
+            ratios.append(highest / tissue._frequency.omega)
         assert tissue._frequency.omega <= 1.01 * growth * tissue._frequency.unscaled
     assert max(ratios) < 1.0
-
-
-def highest_frequency(tissue: Dynamics) -> float:
-    """Of the linear tangent at rest, with the masses of the integration [rad/s]."""
-    operands, root = tissue.model.operands(), np.sqrt(tissue.inverse_mass)
-
-    def scaled(x: np.ndarray) -> np.ndarray:
-        force = np.zeros(len(root))
-        stiffness_product(operands, root * x.ravel(), force)
-        return np.asarray(root * force)
-
-    operator = LinearOperator((len(root), len(root)), matvec=scaled, dtype=float)
-    start = np.random.default_rng(0).standard_normal(len(root))
-    return float(np.sqrt(eigsh(operator, 1, v0=start, return_eigenvectors=False)[0]))
 
 
 def pressed(seconds: float, stiffness: float) -> tuple[ElasticModel, np.ndarray, Coupling]:

@@ -126,16 +126,11 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
     seen = Seen()
     folder = tmp_path_factory.mktemp('view')
     scene = write_scene(folder, two_presses(), 20.0, cut_threshold=0.2)
-    view = View(folder, scene)
-    try:
+    with View(folder, scene) as view:
         url = view.url()
         with chromium((1060, 640), coarseness=2) as browser:
             use(browser, url, seen)
         seen.status = view.end()
-    finally:
-        print(view.said)
-        if view.process.poll() is None:
-            view.end()
     yield seen
     for bag in seen.bags:
         shutil.rmtree(bag)

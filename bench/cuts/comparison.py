@@ -112,7 +112,8 @@ def spread(strokes: tuple[Stroke, ...]) -> Floats:
 
 
 def _shrink(before: TetMesh, after: TetMesh) -> float:
-    one, two = (highest_frequency(ElasticModel(mesh, _TISSUE)) for mesh in (before, after))
+    models = (ElasticModel(mesh, _TISSUE) for mesh in (before, after))
+    one, two = (highest_frequency(model, _inverse(model)) for model in models)
     return two / one
 
 
@@ -175,12 +176,17 @@ def _row(stroke: Stroke, method: str, runs: list[Cut]) -> Row:
     )
 
 
-def highest_frequency(model: ElasticModel) -> float:
-    """Return highest natural frequency with the masses that the tissue has, converged [rad/s]."""
-    root = np.sqrt(_inverse(model))
+def highest_frequency(model: ElasticModel, inverse: Floats) -> float:
+    """Return highest natural frequency of small motions, converged [rad/s].
+
+    Args:
+        model: with the rotations of its shape.
+        inverse: masses by coordinate, 0 where fixed [1/kg], shape (3 n,).
+    """
+    root = np.sqrt(inverse)
 
     def scaled(x: Floats) -> Floats:
-        return np.asarray(root * model.force((root * x.ravel()).reshape(-1, 3)).ravel())
+        return np.asarray(root * model.product((root * x.ravel()).reshape(-1, 3)).ravel())
 
     operator = LinearOperator((len(root), len(root)), matvec=scaled, dtype=float)
     start = np.random.default_rng(0).standard_normal(len(root))
