@@ -64,11 +64,6 @@ EXERCISES = {
         OPENED,
         notches=4,
     ),
-    'pad': Exercise(
-        [line((-0.018, 0, 0.014), (0.0285, 0, 0.014))],
-        [line((-0.018, 0, 0.014), (0, 0, 0.014))],
-        OPENED,
-    ),
     'circle': Exercise(
         [ring(0.02625, 0.004, 1.05)],
         [ring(0.02625, 0.004, 0.5)],
