@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 
-from cutting_trainer.cutting.geometry import EDGE_NODES, height, orientation
+from cutting_trainer.cutting.geometry import EDGE_NODES, height
 from cutting_trainer.cutting.lookup import base_of, edge_key, edge_slot, is_on_cut
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.locate import orientation
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 _EXACT = 1e-6

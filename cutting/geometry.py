@@ -3,6 +3,7 @@
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.locate import orientation
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 EDGE_NODES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
@@ -17,15 +18,6 @@ def height(normal, point, x):
         + normal[1] * (x[1] - point[1])
         + normal[2] * (x[2] - point[2])
     )
-
-
-@inner
-def orientation(a, b, c, d):
-    """Return six times the signed volume of the tetrahedron a b c d [m^3], each shape (3,)."""
-    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    wx, wy, wz = d[0] - a[0], d[1] - a[1], d[2] - a[2]
-    return ux * (vy * wz - vz * wy) + uy * (vz * wx - vx * wz) + uz * (vx * wy - vy * wx)
 
 
 @inner

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cutting_trainer.cutting.geometry import orientation
 from cutting_trainer.cutting.lookup import SNAPPED, is_on_cut, on_cut_bits, origin_of
 from cutting_trainer.cutting.subdivision_cases import FRONT, LABEL_FACES
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.locate import orientation
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 

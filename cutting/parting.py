@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cutting_trainer.cutting.geometry import orientation
 from cutting_trainer.cutting.least_cut import connected, least_cut
 from cutting_trainer.cutting.state_table import outer_bits_of
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.locate import orientation
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, interpolated
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 

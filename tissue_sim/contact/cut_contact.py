@@ -283,6 +283,7 @@ class CutContact:
         self._mesh = mesh
         self._friction = friction
         self._pull = np.zeros((0, 3))
+        self._crushed = np.zeros(0, np.bool_)
         self.lost = self.recovered = 0.0
 
     @property
@@ -290,18 +291,22 @@ class CutContact:
         """Whether there are cut faces."""
         return bool((self._mesh.triangle_kind == CUT).any())
 
-    def find(self, u: np.ndarray, v: np.ndarray, dt: float, substeps: int) -> tuple[NearFaces, int]:
+    def find(
+        self, u: np.ndarray, v: np.ndarray, dt: float, substeps: int, *, flat: bool
+    ) -> tuple[NearFaces, int]:
         """Return the contacts that are near now, and for how many substeps they are known.
 
         Args:
             u, v: displacement [m] and velocity [m/s], shape (n, 3).
             dt: substep [s].
             substeps: of a frame.
+            flat: whether some elements may be pressed flat or inside out.
         """
         mesh, least = self._mesh, max(substeps // MAX_LOOKS, 1)
         self._pull = grown(self._pull, mesh.node_count)
-        surface = mesh.triangles, mesh.triangle_kind, mesh.triangle_face, mesh.tetrahedra
-        contacts, fastest = find_contacts(*surface, mesh.rest, u, v, least * dt)
+        self._crushed = grown(self._crushed, mesh.node_count)
+        given = mesh.links, mesh.rest, u, v, least * dt, flat, self._crushed
+        contacts, fastest = find_contacts(*given)
         nodes = contacts.nodes[:, 0]
         pull = self._pull[nodes]
         self._pull[:] = 0.0
@@ -345,13 +350,14 @@ class CutContact:
         subtract_pulls(faces, out)
         return -out.reshape(-1, 3)
 
-    def kept(self) -> tuple[np.ndarray, float, float]:
+    def kept(self) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Return a copy of the state for `restore`."""
-        return self._pull.copy(), self.lost, self.recovered
+        return self._pull.copy(), self._crushed.copy(), self.lost, self.recovered
 
-    def restore(self, kept: tuple[np.ndarray, float, float]) -> None:
+    def restore(self, kept: tuple[np.ndarray, np.ndarray, float, float]) -> None:
         """Return to a state of `kept`, which stays as it is."""
-        self._pull, self.lost, self.recovered = kept[0].copy(), *kept[1:]
+        self._pull, self._crushed = kept[0].copy(), kept[1].copy()
+        self.lost, self.recovered = kept[2:]
 
     def release(self) -> None:
         """Begin without forces."""
@@ -367,3 +373,5 @@ class CutContact:
         """
         self._pull = grown(self._pull, count + len(delta.node_parents))
         carried_over(self._pull, count, delta, touched)
+        self._crushed = grown(self._crushed, count + len(delta.node_parents))
+        self._crushed[touched.nodes] = False

@@ -2,6 +2,9 @@
 
 A node meets the nearest triangle of a cut face whose normal is opposed to its own and on which it
 has a foot. Triangles are looked through along one axis.
+
+Where an element around a node is pressed flat or inside out, neither the node nor its triangles
+meet anything. Its normals may be turned over, and what it met would hold it as it is.
 """
 
 from typing import NamedTuple
@@ -9,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.tissue_sim.mesh.locate import orientation
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 
 REACH = 5e-4
@@ -27,6 +31,10 @@ smooth in part, from 10 degrees on in full. Smooth flat faces would flutter: the
 quite that of the gap."""
 _BESIDE = 0.05
 """Share of a triangle by which a node may be beside it."""
+_MIN_RATIO, _SOUND_RATIO = 0.25, 0.7
+"""Share of its volume from which on a pressed element has no contact, and that from which on it has
+contact again. The law that stiffens holds down to the first. With one share, contact would come and
+go, and keep the element between both."""
 
 
 class NearFaces(NamedTuple):
@@ -68,17 +76,19 @@ def foot(ax, ay, az, bx, by, bz, x, y, z):
 
 
 @kernel(error_model='numpy')
-def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
+def find_contacts(links, rest, u, v, seconds, flat, crushed):
     """Return the contacts near, and the largest speed of a node of a cut face [m/s].
 
     Args:
-        triangles, kinds, faces: of the surface, see `topology.Links`.
-        tetrahedra: shape (m, 4).
+        links: see `topology.Links`.
         rest, u: rest positions and displacement [m], shape (n, 3).
         v: velocity [m/s], shape (n, 3).
         seconds: until the next search, at least.
+        flat: whether some elements may be pressed flat or inside out.
+        crushed: whether a node had no contact for that reason, changed, shape (n,).
     """
-    cut = np.flatnonzero(kinds == CUT)
+    triangles, faces, tetrahedra = links.triangles, links.triangle_face, links.tetrahedra
+    cut = np.flatnonzero(links.triangle_kind[: links.counts[1]] == CUT)
     count = len(cut)
     number, listed = np.full(len(rest), -1), np.empty(3 * count, np.int64)
     corners, normals, middles = np.empty((count, 9)), np.empty((count, 3)), np.empty((count, 3))
@@ -123,14 +133,18 @@ def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
     order = np.argsort(middles[:, axis], kind='mergesort')
     keys = middles[order, axis]
     stars, smooth = _stars(triangles, cut, number, nodes), np.empty((nodes, 3, 3))
+    if flat:
+        _judge(links, rest, rest + u, listed[:nodes], crushed)
+    else:
+        crushed[:] = False
     found, shapes, contacts = np.empty((nodes, 4), np.int64), np.empty((nodes, 4, 3)), 0
     for j in range(nodes):
         node, place = listed[j], rest[listed[j], axis] + u[listed[j], axis]
         x, y, z = rest[node, 0] + u[node, 0], rest[node, 1] + u[node, 1], rest[node, 2] + u[node, 2]
         nx, ny, nz = own[j, 0], own[j, 1], own[j, 2]
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if length < _ONE_SIDED * own[j, 3]:
-            continue  # at the front: on both sides
+        if length < _ONE_SIDED * own[j, 3] or crushed[node]:
+            continue  # at the front it is on both sides
         nearest, best = np.inf, -1
         for s in range(np.searchsorted(keys, place - widest - reach), count):
             if keys[s] > place + widest + reach:
@@ -152,7 +166,7 @@ def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
             b, c = foot(*_edges(corners, k), px, py, pz)
             if min(min(b, c), 1.0 - b - c) >= -_BESIDE:
                 nearest, best = abs(gap), k
-        if best < 0:
+        if best < 0 or _any(crushed, triangles[cut[best]]):
             continue
         found[contacts, 0] = node
         for a in range(3):
@@ -165,6 +179,27 @@ def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
         contacts += 1
     some = found[:contacts].copy(), shapes[:contacts].copy(), smooth[:contacts].copy()
     return NearFaces(*some), fastest
+
+
+@inner
+def _judge(links, rest, positions, nodes, crushed):
+    """Write which of some nodes have an element that is pressed flat or inside out."""
+    for j in range(len(nodes)):
+        least = _SOUND_RATIO if crushed[nodes[j]] else _MIN_RATIO
+        crushed[nodes[j]] = False
+        corner = links.first_corner[nodes[j]]
+        while corner >= 0 and not crushed[nodes[j]]:
+            a, b, c, d = links.tetrahedra[corner // 4]
+            now = orientation(positions[a], positions[b], positions[c], positions[d])
+            before = orientation(rest[a], rest[b], rest[c], rest[d])
+            crushed[nodes[j]] = now < least * before
+            corner = links.corner_next[corner]
+
+
+@inner
+def _any(crushed, triangle):
+    """Return whether a node of a triangle is crushed."""
+    return crushed[triangle[0]] or crushed[triangle[1]] or crushed[triangle[2]]
 
 
 @inner

@@ -13,6 +13,15 @@ _SKIN = 5e-3
 
 
 @inner
+def orientation(a, b, c, d):
+    """Return six times the signed volume of the tetrahedron a b c d [m^3], each shape (3,)."""
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    wx, wy, wz = d[0] - a[0], d[1] - a[1], d[2] - a[2]
+    return ux * (vy * wz - vz * wy) + uy * (vz * wx - vx * wz) + uz * (vx * wy - vy * wx)
+
+
+@inner
 def barycentric(positions, tetrahedra, tet, point, out):
     """Return barycentric coordinates of a point in a tetrahedron.
 

@@ -279,7 +279,7 @@ class Dynamics:
             motion = self._motion(slow, taken, trouble, contacts)
             energy = motion.kinetic_energy + motion.elastic_energy
             # Cut faces that begin in one another are moved apart: energy of no unstable step.
-            work += self.cut_contact.recovered - met[2]
+            work += self.cut_contact.recovered - met[3]
             found = self._detector.diagnose(self.displacement, energy, work)
             if not found:
                 return motion
@@ -409,7 +409,9 @@ class Dynamics:
                 self.cut_contact.keep(contacts, faces)
                 faces = None
             if done >= look:
-                near, known = self.cut_contact.find(self.displacement, self.velocity, dt, substeps)
+                flat = self._stiffened is not None and self._stiffened.flat
+                at = self.displacement, self.velocity
+                near, known = self.cut_contact.find(*at, dt, substeps, flat=flat)
                 look = done + known
             if region is None or anew:
                 region = self._choose(couplings, near)

@@ -19,6 +19,8 @@ MAX_GROWTH = 2.0
 _STRAINED = 2.0
 """Factor of `StiffenedMass` in a strained tissue: 0.9 to 1.9 in a random mesh with nu 0.3 and 0.45,
 pulled, pressed and twisted."""
+_FLAT = 0.75
+"""Least J of a smoothing domain, a mean of its elements', below which one of them may be flat."""
 SUBSTEPS_BETWEEN = 16
 """Substeps between two adaptations."""
 
@@ -184,6 +186,11 @@ class StiffenedMass:
     def inverse(self, base: np.ndarray) -> np.ndarray:
         """Return the present inverse masses, or `base` before the first adaptation."""
         return self._inverse if len(self._inverse) == len(base) else base
+
+    @property
+    def flat(self) -> bool:
+        """Whether elements may be pressed flat or inside out, by the last adaptation."""
+        return bool(self._strain[2] < _FLAT)
 
     @property
     def strain(self) -> Strain:

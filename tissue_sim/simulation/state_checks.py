@@ -140,6 +140,7 @@ def check_simulation(simulation: TissueSimulation) -> None:
         has_room(name, getattr(dynamics, name), 3 * n)
     has_room('_inertia', dynamics._inertia, n)
     has_room('_pull', dynamics.cut_contact._pull, 0, 3)
+    has_room('_crushed', dynamics.cut_contact._crushed, 0)
     if dynamics.cut_contact._mesh is not mesh:
         raise StateError('the cut faces are of another tissue')
     if dynamics._loose is not None:
