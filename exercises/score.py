@@ -33,6 +33,8 @@ UNITS: dict[MeasureName, tuple[float, str, str]] = {
     'order': (100.0, '%', 'steps in order'),
 }
 """Factor from SI, unit and name of each measure, for people."""
+_WITHOUT: dict[MeasureName, str] = {'lesion_margin': 'the lesion is still held'}
+"""Words for a measure without a value, where there is more to say than 'none'."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def in_words(measure: MeasureName, value: float) -> str:
     """Return a value with its unit, for people."""
     factor, unit, _ = UNITS[measure]
     if math.isnan(value) or abs(value) >= 1e8:
-        return 'none'
+        return _WITHOUT.get(measure, 'none')
     return f'{value * factor:.3g} {unit}'.strip()
 
 

@@ -112,6 +112,57 @@ def test_a_triangle_that_is_pressed_flat_is_not_thrown_away() -> None:
     assert np.abs(v - 1e-3 * 1e5 * force).max() < 0.1
 
 
+def test_a_corner_far_from_the_foot_is_not_thrown_away_where_node_and_foot_are_held() -> None:
+    rest = np.array([[[1e-9, 1e-9, -1e-6], [0, 0, 0], [2e-3, 0, 0], [1e-3, 2e-3, 0]]])
+    near = NearFaces(np.arange(4)[None], rest, np.tile([0.0, 0.0, 1.0], (1, 3, 1)))
+    u, v, q = np.zeros(12), np.zeros(12), np.zeros(12)
+    contact = cut_contact.CutContact(parted(), 0.3)
+    contact._pull = np.zeros((4, 3))
+    faces = contact.operand(near, near.nodes, u, v)
+    faces.inverse[0, 2:] = 1e5
+    cut_contact.meet(faces, u, v, q, 1e-4, 1e-3)
+    assert np.abs(v).max() < 1e-3
+    assert np.abs(faces.pulls).max() < 1.0
+
+
+def nodes_that_meet(
+    rest: np.ndarray, tets: list[list[int]], cut: list[list[int]], u: np.ndarray
+) -> list[int]:
+    """Nodes that meet one of the cut faces; all lengths are in mm."""
+    mesh = TetMesh(1e-3 * rest, np.array(tets))
+    kinds = [CUT if sorted(nodes) in cut else 0 for nodes in mesh.triangles.tolist()]
+    assert kinds.count(CUT) == len(cut)
+    mesh.set_kinds(mesh.triangles.copy(), np.array(kinds, np.uint8))
+    near, _ = cut_contact.CutContact(mesh, 0.3).find(1e-3 * u, np.zeros_like(u), 1e-4, 10)
+    return sorted(near.nodes[:, 0].tolist())
+
+
+WEDGE = np.array([[0, -1, 0], [0, 1, 0], [2, 0, 0], [1.5, 0, -0.1], [1.5, 0, -0.2], [1.5, 0, -0.3]])
+
+
+@pytest.mark.parametrize('joined', [True, False])
+def test_a_node_does_not_meet_a_triangle_with_tissue_between_them(joined: bool) -> None:
+    """Three elements lie around an edge. That in the middle has no cut face, and is inside out."""
+    rest, u = WEDGE, np.zeros((6, 3))
+    u[4:, 2] = 0.4
+    tets, cut = [[0, 1, 2, 3], [0, 1, 3, 4], [0, 1, 4, 5]], [[0, 1, 2], [0, 1, 5]]
+    if not joined:  # the same place and motion, of another piece
+        rest, u = np.concatenate([rest, rest[[0, 1, 4]]]), np.concatenate([u, u[[0, 1, 4]]])
+        tets, cut = [tets[0], [6, 7, 8, 5], [0, 1, 3, 4]], [[0, 1, 2], [5, 6, 7]]
+    assert (5 in nodes_that_meet(rest, tets, cut, u)) != joined
+
+
+def test_an_element_inside_out_meets_nothing() -> None:
+    """Its upper face looks down then, and would be held above the faces under it."""
+    plate = [[0, -1, 0], [0, 1, 0], [2, 0, 0], [0.7, 0, -1]]
+    piece = [[0.3, -0.3, 0.3], [0.3, 0.3, 0.3], [1.0, 0, 0.3], [0.6, 0, 0.1]]
+    rest, turned = np.array(plate + piece), np.zeros((8, 3))
+    turned[4], turned[5] = rest[5] - rest[4], rest[4] - rest[5]
+    tets, lower = [[0, 1, 2, 3], [4, 5, 6, 7]], [[4, 5, 7], [4, 6, 7], [5, 6, 7]]
+    assert 7 in nodes_that_meet(rest, tets, [[0, 1, 2], *lower], 0 * turned)
+    assert nodes_that_meet(rest, tets, [[0, 1, 2], [4, 5, 6]], turned) == []
+
+
 def inclined(friction: float, angle: float, fixed: bool = True) -> tuple[Dynamics, int]:
     """A block on a plate, and its first node: the meshes of their faces do not match."""
     low, plate = box((8, 4, 1), 0.005)

@@ -271,6 +271,20 @@ def test_an_attempt_ends_with_its_time_limit_and_fails(does: str) -> None:
     assert not got.passed and any('the limit is 30 s' in reason for reason in got.reasons)
 
 
+def test_an_attempt_says_that_the_lesion_is_still_held_and_not_that_it_has_no_tissue() -> None:
+    task = ExerciseSettings(
+        title='t',
+        targets=(LINE,),
+        criteria=(CriterionSettings(measure='lesion_margin', good=3e-3, bad=0.0),),
+        lesion=BallSettings(name='lesion', centre=(0, 0, 0), radius=0.006),
+        time_limit=30,
+    )
+    (reason,) = score(task, Attempt(task).measures()).reasons
+    assert reason.startswith(
+        'tissue around the lesion: the lesion is still held; full marks at 3 mm'
+    )
+
+
 def test_measures_do_not_depend_on_how_samples_were_batched() -> None:
     random = np.random.default_rng(4)
     motion = np.cumsum(random.normal(size=(3000, 11)) * 1e-4, axis=0)

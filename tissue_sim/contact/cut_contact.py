@@ -44,6 +44,9 @@ _MAX_RECOVERY = 0.05
 _MAX_WEIGHT = 2.0
 """Largest weight of a node of a triangle. Where the foot is farther off, as beside a triangle that
 is pressed flat, there is no contact: a small impulse would throw the triangle's nodes away."""
+_MAX_LEVER = 10.0
+"""Largest way of a node for a change of the gap. Where node and foot are held, and only a corner
+far from the foot moves, there is no contact: closing the gap would throw that corner away."""
 
 
 class CutContacts(NamedTuple):
@@ -210,11 +213,12 @@ def meet(faces, u, v, q, beta, dt):
         x, y, z = _difference(faces, u, c)
         offsets[c] = gap - x * normals[c, 0] - y * normals[c, 1] - z * normals[c, 2]
         wanted[c] = min(_RECOVERY * depth, _MAX_RECOVERY * dt) - depth - offsets[c]
-        largest = 0.0
+        largest = farthest = 0.0
         for k in range(4):
-            largest = max(largest, abs(weights[c, k]))
-            response[c] += weights[c, k] ** 2 * faces.inverse[c, k]
-        if not largest <= _MAX_WEIGHT:
+            weight = abs(weights[c, k])
+            largest, farthest = max(largest, weight), max(farthest, weight * faces.inverse[c, k])
+            response[c] += weight * weight * faces.inverse[c, k]
+        if not (largest <= _MAX_WEIGHT and farthest <= _MAX_LEVER * response[c]):
             pulls[c, 0] = pulls[c, 1] = pulls[c, 2] = response[c] = 0.0
     for c in range(count):
         if response[c] > 0.0:
@@ -300,8 +304,7 @@ class CutContact:
         """
         mesh, least = self._mesh, max(substeps // MAX_LOOKS, 1)
         self._pull = grown(self._pull, mesh.node_count)
-        surface = mesh.triangles, mesh.triangle_kind, mesh.triangle_face, mesh.tetrahedra
-        contacts, fastest = find_contacts(*surface, mesh.rest, u, v, least * dt)
+        contacts, fastest = find_contacts(mesh.links, mesh.rest, u, v, least * dt)
         nodes = contacts.nodes[:, 0]
         pull = self._pull[nodes]
         self._pull[:] = 0.0

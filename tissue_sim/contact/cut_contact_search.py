@@ -2,6 +2,11 @@
 
 A node meets the nearest triangle of a cut face whose normal is opposed to its own and on which it
 has a foot. Triangles are looked through along one axis.
+
+Two kinds of contact would keep an element inside out, so they are left out. The normals of an
+element that is inside out are turned over: its triangle and its nodes meet nothing. A node that is
+behind a triangle at rest, and close to it in the same tissue, is in front of it only where tissue
+between them is inside out: the two do not meet.
 """
 
 from typing import NamedTuple
@@ -25,6 +30,9 @@ _FLAT, _BENT = 0.998, 0.985
 """Cosines between the normals of a triangle and of its node: from 4 degrees on the surface is
 smooth in part, from 10 degrees on in full. Smooth flat faces would flutter: their normal is not
 quite that of the gap."""
+_BEHIND = -0.02
+"""Cosine, at rest, between the normal of a triangle and the way to a node, below which the node is
+behind it. The faces of a cut are in one another at rest, but for rounding and curvature."""
 _BESIDE = 0.05
 """Share of a triangle by which a node may be beside it."""
 
@@ -68,17 +76,17 @@ def foot(ax, ay, az, bx, by, bz, x, y, z):
 
 
 @kernel(error_model='numpy')
-def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
+def find_contacts(links, rest, u, v, seconds):
     """Return the contacts near, and the largest speed of a node of a cut face [m/s].
 
     Args:
-        triangles, kinds, faces: of the surface, see `topology.Links`.
-        tetrahedra: shape (m, 4).
+        links: see `topology.Links`.
         rest, u: rest positions and displacement [m], shape (n, 3).
         v: velocity [m/s], shape (n, 3).
         seconds: until the next search, at least.
     """
-    cut = np.flatnonzero(kinds == CUT)
+    triangles = links.triangles
+    cut = np.flatnonzero(links.triangle_kind[: links.counts[1]] == CUT)
     count = len(cut)
     number, listed = np.full(len(rest), -1), np.empty(3 * count, np.int64)
     corners, normals, middles = np.empty((count, 9)), np.empty((count, 3)), np.empty((count, 3))
@@ -96,13 +104,20 @@ def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         size = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-300)
         sizes[k] = np.sqrt(size)
+        far = _opposite(links, cut[k])
+        x = rest[far, 0] + u[far, 0] - corners[k, 0]
+        y = rest[far, 1] + u[far, 1] - corners[k, 1]
+        z = rest[far, 2] + u[far, 2] - corners[k, 2]
+        turned = x * nx + y * ny + z * nz > 0.0
+        if turned:
+            nx = ny = nz = 0.0
         normals[k, 0], normals[k, 1], normals[k, 2] = nx / size, ny / size, nz / size
         for a in range(3):
             at = number[triangles[cut[k], a]]
             own[at, 0] += nx
             own[at, 1] += ny
             own[at, 2] += nz
-            own[at, 3] += size
+            own[at, 3] += np.inf if turned else size
         radii[k] = 0.0
         for i in range(3):
             middles[k, i] = (corners[k, i] + corners[k, 3 + i] + corners[k, 6 + i]) / 3.0
@@ -130,7 +145,7 @@ def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
         nx, ny, nz = own[j, 0], own[j, 1], own[j, 2]
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
         if length < _ONE_SIDED * own[j, 3]:
-            continue  # at the front: on both sides
+            continue  # at the front, where it is on both sides; or of an element inside out
         nearest, best = np.inf, -1
         for s in range(np.searchsorted(keys, place - widest - reach), count):
             if keys[s] > place + widest + reach:
@@ -143,14 +158,12 @@ def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
             gap = px * normals[k, 0] + py * normals[k, 1] + pz * normals[k, 2]
             if cosine > _OPPOSED * length or gap > reach or abs(gap) >= nearest:
                 continue
-            tet = faces[cut[k]] // 4
-            behind = tetrahedra[tet, 0] == node or tetrahedra[tet, 1] == node
-            behind = behind or tetrahedra[tet, 2] == node or tetrahedra[tet, 3] == node
-            if behind or gap < -_DEPTH * sizes[k]:
+            if gap < -_DEPTH * sizes[k] or _opposite(links, cut[k]) == node:
                 continue
             px, py, pz = x - corners[k, 0], y - corners[k, 1], z - corners[k, 2]
             b, c = foot(*_edges(corners, k), px, py, pz)
-            if min(min(b, c), 1.0 - b - c) >= -_BESIDE:
+            beside = min(min(b, c), 1.0 - b - c) < -_BESIDE
+            if not (beside or _through_tissue(links, rest, cut[k], node)):
                 nearest, best = abs(gap), k
         if best < 0:
             continue
@@ -165,6 +178,43 @@ def find_contacts(triangles, kinds, faces, tetrahedra, rest, u, v, seconds):
         contacts += 1
     some = found[:contacts].copy(), shapes[:contacts].copy(), smooth[:contacts].copy()
     return NearFaces(*some), fastest
+
+
+@inner
+def _opposite(links, t):
+    """Return the node of a triangle's element that is not on the triangle."""
+    face = links.triangle_face[t]
+    return links.tetrahedra[face // 4, face % 4]
+
+
+@inner
+def _through_tissue(links, rest, t, node):
+    """Return whether a node is behind a triangle at rest, and close to it in the same tissue.
+
+    Close: one element, or two with a common face, join the node with a node of the triangle.
+    """
+    a, b, c = links.triangles[t, 0], links.triangles[t, 1], links.triangles[t, 2]
+    ax, ay, az = rest[b, 0] - rest[a, 0], rest[b, 1] - rest[a, 1], rest[b, 2] - rest[a, 2]
+    bx, by, bz = rest[c, 0] - rest[a, 0], rest[c, 1] - rest[a, 1], rest[c, 2] - rest[a, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    x = rest[node, 0] - rest[a, 0] - (ax + bx) / 3.0
+    y = rest[node, 1] - rest[a, 1] - (ay + by) / 3.0
+    z = rest[node, 2] - rest[a, 2] - (az + bz) / 3.0
+    size = np.sqrt((nx * nx + ny * ny + nz * nz) * (x * x + y * y + z * z))
+    if x * nx + y * ny + z * nz >= _BEHIND * size:
+        return False
+    corner = links.first_corner[node]
+    while corner >= 0:
+        face = links.neighbors[corner // 4, corner % 4]
+        beyond = links.tetrahedra[face // 4, face % 4] if face >= 0 else -1
+        if beyond == a or beyond == b or beyond == c:
+            return True
+        for i in range(4):
+            other = links.tetrahedra[corner // 4, i]
+            if other == a or other == b or other == c:
+                return True
+        corner = links.corner_next[corner]
+    return False
 
 
 @inner
