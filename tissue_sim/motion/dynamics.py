@@ -246,6 +246,7 @@ class Dynamics:
             return self.stepping.max_substeps * self._caution, dt
         return substeps, self._frame_time / substeps
 
+    @np.errstate(over='ignore', invalid='ignore')  # the numbers of a frame that diverges
     def advance(self, *couplings: Coupling, tools: Sequence[Tool] = ()) -> FrameMotion:
         """Integrate a frame; after divergence, retry it with shorter steps.
 
