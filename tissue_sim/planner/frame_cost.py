@@ -26,8 +26,9 @@ _REPEATS = 3
 """Strokes; the least time of each frame counts, because other load only adds to it."""
 _ENOUGH_S = 0.4
 """CPU time after which strokes are not repeated."""
-_HOPELESS = 4.0
-"""Cost, in shares of the allowed one, at which implicit steps are not tried elsewhere."""
+_HOPELESS = 2.0
+"""Cost, in shares of the allowed one, at which implicit steps are not tried again or elsewhere:
+the dearest place counts. Other load may double a cost, so that one below it may still fit."""
 _NEVER, _TOUCH = 1e9, 1e-6
 """Forces at which the blade enters [N]: never, and where it touches."""
 _COUPLING = 200.0
@@ -279,7 +280,10 @@ def with_sleepers(task: Task, candidate: Candidate, depth: float) -> Candidate:
     active = ActiveSettings('on')
     both = [_Strokes(task, candidate, depth, region) for region in (ActiveSettings(), active)]
     right, seen = (strokes.stroke() for strokes in both)
+    start = time.process_time()
     for _ in range(_REPEATS - 1):  # alternately, so that both see the same load of the machine
+        if time.process_time() - start > _ENOUGH_S:
+            break
         for strokes in both:
             strokes.stroke()
     most = float(np.linalg.norm(right, axis=2).max())
