@@ -27,8 +27,8 @@ _REPEATS = 3
 _ENOUGH_S = 0.4
 """CPU time after which strokes are not repeated."""
 _HOPELESS = 2.0
-"""Cost, in shares of the allowed one, at which implicit steps are not tried again or elsewhere:
-the dearest place counts. Other load may double a cost, so that one below it may still fit."""
+"""Cost, in shares of the allowed one, at which implicit steps are not tried elsewhere: the dearest
+place counts, and other load no more than doubles a cost."""
 _NEVER, _TOUCH = 1e9, 1e-6
 """Forces at which the blade enters [N]: never, and where it touches."""
 _COUPLING = 200.0
@@ -77,10 +77,9 @@ def frame_cost(
         found: list[_Timed] = []
         for indenter in indenters:
             found.append(_Timed(task, model, integrator, indenter, depth, _LONG, active))
-            found[-1].stroke()
+            found[-1].stroke(2)
             if found[-1].frame > _HOPELESS * task.available:
                 break
-            found[-1].stroke()
         return Cost(found[0].substeps, found[0].step, max(timed.frame for timed in found), 0.0)
     long, short = (
         _Timed(task, model, integrator, indenters[0], depth, most, active)
