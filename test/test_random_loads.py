@@ -19,7 +19,9 @@ def test_a_tissue_that_was_yanked_pressed_or_cut_comes_back_within_a_second() ->
     assert not outcome.failed, outcome
 
 
-@pytest.mark.parametrize('wrong', [{'bad': 1}, {'silent': 1}, {'inverted': 1}, {'least': 0.2}])
+@pytest.mark.parametrize(
+    'wrong', [{'bad': 1}, {'silent': 1}, {'inverted': 1}, {'least': 0.8}, {'largest': 1.2}]
+)
 def test_each_claim_can_fail_a_mesh(wrong: dict[str, float]) -> None:
     assert not Outcome(0, said=3).failed
     assert Outcome(0, **wrong).failed  # type: ignore[arg-type]
