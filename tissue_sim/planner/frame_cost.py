@@ -85,19 +85,28 @@ def frame_cost(
         _Timed(task, model, integrator, indenters[0], depth, most, active)
         for most in (_LONG, _SHORT)
     )
-    start = time.process_time()
-    for _ in range(_REPEATS):  # alternately, so that both see the same load of the machine
+    for _ in _repeats(_REPEATS):
         long.stroke()
         if long.substeps > _LONG:
             short.stroke()
-        if time.process_time() - start > _ENOUGH_S:
-            break
     if long.substeps == 1:
         return Cost(1, long.step, long.frame, 0.0)
     if long.substeps <= _LONG:
         return Cost(long.substeps, long.step, 0.0, long.frame / long.substeps)
     each = max((long.frame - short.frame) / (_LONG - _SHORT), long.frame / _LONG / 4)
     return Cost(long.substeps, long.step, max(long.frame - _LONG * each, 0.0), each)
+
+
+def _repeats(most: int) -> Iterator[int]:
+    """Yield numbers of repeats up to a largest one, or until `_ENOUGH_S` of CPU time are over.
+
+    Two simulations take turns in each, so that both see the same load of the machine.
+    """
+    start = time.process_time()
+    for number in range(most):
+        yield number
+        if time.process_time() - start > _ENOUGH_S:
+            return
 
 
 def frame_time(integrator: IntegratorName, times: list[float]) -> float:
@@ -279,10 +288,7 @@ def with_sleepers(task: Task, candidate: Candidate, depth: float) -> Candidate:
     active = ActiveSettings('on')
     both = [_Strokes(task, candidate, depth, region) for region in (ActiveSettings(), active)]
     right, seen = (strokes.stroke() for strokes in both)
-    start = time.process_time()
-    for _ in range(_REPEATS - 1):  # alternately, so that both see the same load of the machine
-        if time.process_time() - start > _ENOUGH_S:
-            break
+    for _ in _repeats(_REPEATS - 1):
         for strokes in both:
             strokes.stroke()
     most = float(np.linalg.norm(right, axis=2).max())
