@@ -199,8 +199,8 @@ def test_a_node_that_plans_says_what_it_takes_and_warns_when_a_cut_breaks_the_bu
     assert found.chosen is not None
     share = ROOM * 30.0 * found.chosen.cost.frame
     surroundings, log = run(planning_scene(tmp_path, cores=share))
+    wait_for(lambda: 'method: linear_smoothed by ' in log.read_text(), 'the method in the log')
     said = log.read_text()
-    assert 'method: linear_smoothed by ' in said
     assert '103 % by elements of this size, 12 % by the footprint of the tool; 90 %' in said
     wait_for(lambda: 'substeps' in surroundings.values(), 'a frame')
     values = surroundings.values()
@@ -223,7 +223,7 @@ def test_a_node_for_whose_budget_nothing_fits_runs_as_the_scene_says_and_says_so
     surroundings, log = run(planning_scene(tmp_path, error=0.1))
     given = load_scene(str(tmp_path / 'scene.yaml')).tissue
     sentence = f'no method fits the budget, so {given.model} by {given.integrator} is taken'
-    assert sentence in log.read_text()
+    wait_for(lambda: sentence in log.read_text(), 'the sentence in the log')
     wait_for(lambda: 'substeps' in surroundings.values(), 'a frame')
     wait_for(lambda: sentence in surroundings.status.message, 'the status')
     assert surroundings.status.level == DiagnosticStatus.WARN
