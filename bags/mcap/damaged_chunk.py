@@ -2,6 +2,7 @@
 
 import re
 import struct
+import sys
 from dataclasses import replace
 
 from mcap.opcode import Opcode
@@ -26,6 +27,8 @@ _PACKED = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 _NAMES = ('', *_PACKED.values())
 _FIXED = struct.Struct('<QQQI')
 _LENGTH = struct.Struct('<Q')
+_MIN_MESSAGE = 22
+"""Bytes of a message before its data."""
 
 
 def inner_length(body: bytes) -> int | None:
@@ -80,24 +83,31 @@ def prefix(data: bytes) -> tuple[list[McapRecord], bool]:
 
 
 def behind(
-    data: bytes, counted: list[tuple[int, int, int]], before: list[McapRecord]
+    unpacked: Unpacked, counted: list[tuple[int, int, int]], before: list[McapRecord]
 ) -> list[McapRecord]:
     """Return messages behind damage within a chunk: those in an index.
 
+    A message that says it is longer than its place ends where the next one begins.
+
     Args:
-        data: the unpacked chunk.
+        unpacked: the chunk.
         counted: channel, log time and place of its messages, by the indexes behind it.
         before: messages found without the indexes.
     """
     known = {(m.channel_id, m.log_time, m.sequence) for m in before if isinstance(m, Message)}
     found: list[McapRecord] = []
-    for channel, time, at in sorted(counted, key=lambda entry: entry[2]):
+    data = unpacked.data
+    last = len(data) if unpacked.complete else sys.maxsize
+    listed = sorted(counted, key=lambda entry: entry[2])
+    places = [at for _, _, at in listed]
+    for (channel, time, at), after in zip(listed, [*places[1:], last], strict=False):
         head = data[at : at + HEAD.size]
         if len(head) < HEAD.size or head[0] != Opcode.MESSAGE:
             continue
-        length = HEAD.unpack(head)[1]
-        body = data[at + HEAD.size : at + HEAD.size + length]
-        if len(body) != length or length < 22:
+        begin = at + HEAD.size
+        end = min(begin + HEAD.unpack(head)[1], after)
+        body = data[begin:end]
+        if len(body) != end - begin or len(body) < _MIN_MESSAGE:
             continue
         message = read_record(Opcode.MESSAGE, body)
         assert isinstance(message, Message)

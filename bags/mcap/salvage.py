@@ -326,7 +326,7 @@ class Salvage:
         if part.damaged:
             if not unpacked.complete:  # messages that no other reader returns must be likely
                 found = [m for m in found if _is_likely(m, part)]
-            found += behind(unpacked.data, counted or [], found)
+            found += behind(unpacked, counted or [], found)
         self._take(part, found)
         return part
 

@@ -202,8 +202,22 @@ def outcome(folder: Path, *, rosbags: bool = False) -> Outcome:
     for name, heard in after.items():
         if not heard.refusal and name != 'record by record' and heard.messages != kept:
             refused.append(f'{name}: other messages')
-    missing = max(len(heard.messages.keys() - kept.keys()) for heard in before.values())
+    missing = max(_missing(heard.messages, kept) for heard in before.values())
     return Outcome(whole, tuple(refused), missing, '')
+
+
+def _missing(heard: Messages, kept: Messages) -> int:
+    """Return the number of messages that are not kept.
+
+    One whose length is damaged reads on into the messages after it: its begin has to be kept.
+    """
+    begins: dict[int, list[bytes]] = {}
+    for time, data in kept:
+        begins.setdefault(time, []).extend([data] if data else [])
+    return sum(
+        not any(data.startswith(begin) for begin in begins.get(time, ()))
+        for time, data in heard.keys() - kept.keys()
+    )
 
 
 def main() -> int:
