@@ -24,6 +24,7 @@ from cutting_trainer.exercises.opened_tissue import (
     Curve,
     Opened,
     Tissue,
+    bridge,
     cut_faces,
     free_pieces,
     lesion_margin,
@@ -36,6 +37,8 @@ Floats = NDArray[np.float64]
 NAN = float('nan')
 _BEGUN = 0.1
 """Opened share of a target from which it counts as begun."""
+_NEARLY = 0.9
+"""Opened share of the targets from which a bridge that still holds the lesion is looked for."""
 
 
 class Attempt:
@@ -56,6 +59,7 @@ class Attempt:
         self._touched: list[str] = []
         self._pieces = 0
         self._margin = -math.inf
+        self._bridge: tuple[int, int] | None = None
 
     def add_motion(self, samples: Floats) -> None:
         """Add samples of the tool.
@@ -86,11 +90,18 @@ class Attempt:
         self._pieces = free_pieces(tissue)
         if exercise.lesion:
             self._margin = lesion_margin(tissue, exercise.lesion)
+            nearly = bool(self._curves) and self._coverage_of_all() >= _NEARLY
+            self._bridge = bridge(tissue, exercise.lesion, exercise.targets) if nearly else None
 
     @property
     def zones_touched(self) -> tuple[str, ...]:
         """Names of the forbidden zones that cut faces reach into."""
         return tuple(self._touched)
+
+    @property
+    def bridge(self) -> tuple[int, int] | None:
+        """Nodes of the edge by which tissue still holds a lesion that is nearly cut out."""
+        return self._bridge
 
     @property
     def coverage(self) -> tuple[Coverage, ...]:
@@ -220,10 +231,8 @@ class Attempt:
             return values
         if total > 0:
             values['excess'] = values['damage'] / total
-        lengths = np.array([curve.length for curve in self._curves])
-        shares = np.array([coverage.opened for coverage in self._coverage] or [0.0] * len(lengths))
-        values['coverage'] = float(shares @ lengths / lengths.sum())
-        weight = shares * lengths
+        values['coverage'] = self._coverage_of_all()
+        weight = self._opened_lengths()
         if weight.any():
             errors = np.array([c.depth_error for c in self._coverage])
             values['depth_error'] = float(
@@ -231,6 +240,16 @@ class Attempt:
             )
         values['order'] = self._order()
         return values
+
+    def _opened_lengths(self) -> Floats:
+        """Return the opened length of each target [m], shape (k,)."""
+        lengths = [curve.length for curve in self._curves]
+        shares = [coverage.opened for coverage in self._coverage] or [0.0] * len(lengths)
+        return np.multiply(shares, lengths)
+
+    def _coverage_of_all(self) -> float:
+        """Return the opened share of the length of all targets."""
+        return float(self._opened_lengths().sum() / sum(curve.length for curve in self._curves))
 
     def _order(self) -> float:
         """Return the share of steps from a target to the next that were begun in order."""

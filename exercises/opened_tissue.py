@@ -10,10 +10,13 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from cutting_trainer.exercises.scene_schema import BallSettings, TargetSettings, ZoneSettings
 from cutting_trainer.tissue_sim.mesh import pieces
+from cutting_trainer.tissue_sim.mesh.checks import EDGES
 from cutting_trainer.tissue_sim.mesh.pieces import free_parts
 
 Floats = NDArray[np.float64]
@@ -204,15 +207,8 @@ def lesion_margin(tissue: Tissue, lesion: BallSettings) -> float:
     centre: negative where the cut goes into it, -1e9 while the lesion is not off.
     """
     part = free_parts(tissue)
-    rest, tetrahedra = np.asarray(tissue.rest, float), np.asarray(tissue.tetrahedra)
-    corners = rest[tetrahedra]
-    frame = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    usable = np.abs(np.linalg.det(frame)) > 1e-300
-    places = np.full((len(tetrahedra), 3), -1.0)
-    right = (np.array(lesion.centre) - corners[usable, 0])[..., None]
-    places[usable] = np.linalg.solve(frame[usable], right)[..., 0]
-    least = np.minimum(places.min(axis=1), 1 - places.sum(axis=1))
-    own = int(part[tetrahedra[int(least.argmax()), 0]])
+    rest = np.asarray(tissue.rest, float)
+    own = int(part[_node_in(tissue, lesion)])
     if not own:
         return -_NOWHERE
     triangles = np.asarray(tissue.triangles)
@@ -223,6 +219,46 @@ def lesion_margin(tissue: Tissue, lesion: BallSettings) -> float:
         return -_NOWHERE
     off = np.linalg.norm(points - np.array(lesion.centre), axis=1)
     return float(off.min()) - lesion.radius
+
+
+def _node_in(tissue: Tissue, lesion: BallSettings) -> int:
+    """Return a node of the element that contains the centre of a lesion, at rest."""
+    rest, tetrahedra = np.asarray(tissue.rest, float), np.asarray(tissue.tetrahedra)
+    corners = rest[tetrahedra]
+    frame = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    usable = np.abs(np.linalg.det(frame)) > 1e-300
+    places = np.full((len(tetrahedra), 3), -1.0)
+    right = (np.array(lesion.centre) - corners[usable, 0])[..., None]
+    places[usable] = np.linalg.solve(frame[usable], right)[..., 0]
+    least = np.minimum(places.min(axis=1), 1 - places.sum(axis=1))
+    return int(tetrahedra[int(least.argmax()), 0])
+
+
+def bridge(
+    tissue: Tissue, lesion: BallSettings, targets: Sequence[TargetSettings]
+) -> tuple[int, int] | None:
+    """Return the edge by which tissue still holds a lesion: two nodes; None where it is off.
+
+    The shortest way through the tissue from the lesion to a fixed node leads over a bridge; the
+    edge is that of the way whose middle is nearest to a target, as seen along z at rest.
+    """
+    rest, tetrahedra = np.asarray(tissue.rest, float), np.asarray(tissue.tetrahedra)
+    start, count = _node_in(tissue, lesion), len(rest)
+    links = np.unique(np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0)
+    lengths = np.linalg.norm(rest[links[:, 0]] - rest[links[:, 1]], axis=1)
+    graph = csr_array((np.maximum(lengths, 1e-12), tuple(links.T)), (count, count))
+    away, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+    away[np.asarray(tissue.fixed) != 1] = np.inf
+    node = int(away.argmin())
+    if not np.isfinite(away[node]) or node == start:
+        return None
+    way = [node]
+    while way[-1] != start:
+        way.append(int(before[way[-1]]))
+    middles = 0.5 * (rest[way[1:]] + rest[way[:-1]])[:, :2]
+    off = np.min([distance_to_line(middles, t.corners()[:, :2]) for t in targets], axis=0)
+    k = int(off.argmin())
+    return way[k + 1], way[k]
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from meshes import box
 
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.exercises.bag_feed import read_attempt
@@ -18,6 +19,7 @@ from cutting_trainer.exercises.motion import (
 )
 from cutting_trainer.exercises.opened_tissue import (
     Curve,
+    bridge,
     cut_faces,
     distance_to_line,
     lesion_margin,
@@ -153,6 +155,31 @@ def test_margin_of_a_lesion_is_that_to_the_cut_and_none_while_it_is_held() -> No
     assert lesion_margin(tissue, lesion) == pytest.approx(0.9, abs=0.01)
     tissue.fixed[0] = 1
     assert lesion_margin(tissue, lesion) < -1e6
+
+
+@pytest.mark.parametrize('degrees', [-150, 24, 90])
+def test_a_bridge_is_found_where_a_lesion_is_still_held(degrees: int) -> None:
+    nodes, tetrahedra = box((40, 40, 2), 0.002)
+    nodes -= [0.04, 0.04, 0]
+    middles = nodes[tetrahedra].mean(axis=1)
+    angle = np.degrees(np.arctan2(middles[:, 1], middles[:, 0]))
+    radius = np.linalg.norm(middles[:, :2], axis=1)
+    apart = (abs(radius - 0.02) < 0.0035) & (abs((angle - degrees + 180) % 360 - 180) > 8)
+    tissue = SimpleNamespace(
+        rest=nodes,
+        tetrahedra=tetrahedra[~apart],
+        fixed=(abs(nodes[:, :2]).max(axis=1) > 0.0395).astype(np.uint8),
+    )
+    lesion = BallSettings(name='lesion', centre=(0, 0, 0.002), radius=0.005)
+    circle = CircleSettings(centre=(0, 0, 0.004), radius=0.02)
+    ring = TargetSettings(name='ring', circle=circle, depth=(0.003, 0.005))
+    edge = bridge(tissue, lesion, (ring,))
+    assert edge is not None
+    x, y, _ = tissue.rest[list(edge)].mean(axis=0)
+    assert np.hypot(x, y) == pytest.approx(0.02, abs=0.002)
+    assert abs((np.degrees(np.arctan2(y, x)) - degrees + 180) % 360 - 180) < 10
+    tissue.tetrahedra = tetrahedra[abs(radius - 0.02) >= 0.0035]
+    assert bridge(tissue, lesion, (ring,)) is None
 
 
 def minimum_jerk(seconds: float, length: float) -> np.ndarray:

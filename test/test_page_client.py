@@ -517,6 +517,7 @@ def test_exercise_is_read_at_every_size_and_stands_beside_the_picture(
             'attempt',
             rows=[{'name': 'peak force', 'value': '5.2 N', 'over': True}] * 5,
             score={'points': 61, 'passed': False, 'reasons': [reason] * 6},
+            bridge=None,
         )
     with opened(browser, stand_in) as page:
         for width, height in SIZES:

@@ -83,7 +83,10 @@ class AttemptProgress:
                 'passed': result.passed,
                 'reasons': result.reasons[:_MAX_REASONS],
             }
-        return {'rows': self._rows(measures), 'score': found}
+        bridge = None
+        if attempt.bridge is not None:
+            bridge = replica.positions()[list(attempt.bridge)].mean(axis=0).tolist()
+        return {'rows': self._rows(measures), 'score': found, 'bridge': bridge}
 
     def _rows(self, measures: dict[MeasureName, float]) -> list[dict[str, Any]]:
         """Return name, value and whether it is beyond its limit, of what the trainee may know."""

@@ -169,7 +169,7 @@ class LivePage:
         """Replace the drawn tools and the exercise, for another tissue."""
         self._tools, self._gauge = tools, None
         self._begin_exercise(exercise)
-        self._server.put('attempt', rows=[], score=None)
+        self._server.put('attempt', rows=[], score=None, bridge=None)
 
     def _begin_exercise(self, exercise: ExerciseSettings) -> None:
         self._exercise, self.scored = exercise, False

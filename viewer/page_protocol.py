@@ -19,7 +19,7 @@ the one before:
 | moment | tip, wxyz, proxy, force, depth, can_guide, contact, clutched, further: tip and wxyz of each further tool, null where it is not known |
 | plots | span, lines of title, unit, times, values and colours by name, least |
 | playhead | time, playing, speed |
-| attempt | rows of name, value, over; score: null, or points, passed, reasons once the attempt is over |
+| attempt | rows of name, value, over; score: null, or points, passed, reasons once the attempt is over; bridge: null, or the place of the tissue that still holds a nearly freed lesion [m] |
 | attempts | rows of bag, subject, exercise, attempt, begun, state, points, passed, newest first |
 | replay | number: of the request, link: to open |
 | notice | id, text |

@@ -22,3 +22,4 @@ export const BAND = 'rgba(255, 246, 228, 0.42)', BAND_EDGE = 'rgba(255, 250, 240
 export const ZONE = 'rgba(250, 200, 0, 0.62)', HATCH = 'rgba(20, 12, 4, 0.9)'; // not to be cut
 export const LESION = 'rgba(70, 40, 60, 0.45)', DOTS = 'rgba(36, 14, 40, 0.9)';
 export const ENDS = 0xf4f8fb; // of the tip's way
+export const ATTACHED = 0x7dffb0; // around the last tissue that holds a lesion

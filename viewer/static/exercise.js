@@ -1,6 +1,8 @@
 // The exercise in the picture: ink on the tissue, and rings where the tip begins and ends.
 
-import { BAND, BAND_EDGE, DOTS, ENDS, HATCH, LESION, TARGET, ZONE } from './colours.js';
+import {
+  ATTACHED, BAND, BAND_EDGE, DOTS, ENDS, HATCH, LESION, TARGET, ZONE,
+} from './colours.js';
 import {
   CanvasTexture, Group, LinearFilter, Mesh, MeshBasicMaterial, SRGBColorSpace, TorusGeometry,
 } from './vendor/three.module.min.js';
@@ -10,6 +12,7 @@ const EDGE = 0.0004; // [m] line around an area
 const DASH = 0.0032, GAP = 0.0018; // [m] of a target's line
 const PATTERN = 0.0022; // [m] period of hatching and dots
 const RING = 0.00025; // [m] radius of a ring's wire
+const BRIDGE = 0.0014; // [m] half the radius of the ring around what holds a lesion
 
 /**
  * The ink on the tissue, seen along z, as a texture by x and y at rest [m]; null: there is none.
@@ -138,6 +141,28 @@ function dots(context) {
   context.beginPath();
   context.arc(0.5, 0.5, 0.22, 0, 2 * Math.PI);
   context.fill();
+}
+
+/** A ring around the last tissue that holds a lesion, seen through all else. */
+export class Bridge {
+  constructor(scene) {
+    const material = new MeshBasicMaterial({ color: ATTACHED, depthTest: false, transparent: true });
+    this._ring = new Mesh(new TorusGeometry(2 * BRIDGE, BRIDGE / 4, 6, 32), material);
+    this._ring.renderOrder = 4;
+    this._ring.visible = false;
+    scene.add(this._ring);
+  }
+
+  /** @param {number[]|null} place */
+  show(place) {
+    this._ring.visible = place !== null;
+    if (place !== null) this._ring.position.fromArray(place);
+  }
+
+  /** Where its label is, null while there is none. */
+  get place() {
+    return this._ring.visible ? this._ring.position.clone() : null;
+  }
 }
 
 /** Rings where the tip begins and ends, with their names. */

@@ -63,7 +63,10 @@ const takers = {
     allowGuide();
     guide?.show();
   },
-  attempt: (message) => task.show(message),
+  attempt: (message) => {
+    task.show(message);
+    onStage(() => stage.showBridge(message.bridge));
+  },
   attempts: (message) => training.show(message),
   replay: (message) => training.open(message),
   plots: (message) => {
@@ -253,6 +256,7 @@ function snapshot() {
     canGuide: guide?.allowed ?? false,
     cutting: guide?.cutting ?? false,
     goal: guide?.goal?.position.toArray() ?? null,
+    bridge: stage?.bridge.place?.toArray() ?? null,
     meshes: seen.meshes,
     moments: seen.moments,
     plots: seen.plots,

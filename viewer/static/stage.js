@@ -4,7 +4,7 @@ import {
   DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
 } from './vendor/three.module.min.js';
 import { OrbitControls } from './vendor/OrbitControls.js';
-import { Ends, inkOf } from './exercise.js';
+import { Bridge, Ends, inkOf } from './exercise.js';
 import { Floor } from './floor.js';
 import { RelaxedSurface } from './relaxed_surface.js';
 import { TipMarks } from './tip_marks.js';
@@ -54,6 +54,7 @@ export class Stage {
     this.arrow = new Arrow(this.scene);
     this.marks = new TipMarks(this.scene);
     this.ends = new Ends(this.scene);
+    this.bridge = new Bridge(this.scene);
     this._ink = null;
     this._exercise = 'null'; // as text, to see whether it is another one
     this.surface = new RelaxedSurface();
@@ -91,7 +92,7 @@ export class Stage {
     // Kept tissues keep their faces: the server does not send them again.
     for (const tissue of hello.tissues) this._tissue(tissue.name).look(tissue);
     this._shown = names[0];
-    this._label(hello.tissues, this.ends.show(hello.exercise));
+    this._label(hello.tissues, this.ends.show(hello.exercise), hello.exercise?.lesion ?? null);
     this._inkTissues(hello.exercise);
     this.tool.equip(hello.tool);
     this._equipFurther(hello.further_tools);
@@ -189,6 +190,12 @@ export class Stage {
     this.invalidate();
   }
 
+  /** @param {number[]|null} place of the last tissue that holds the lesion */
+  showBridge(place) {
+    this.bridge.show(place);
+    this.invalidate();
+  }
+
   _mark() {
     if (this.moment === null) return;
     const { position, quaternion } = this.tool.group;
@@ -270,7 +277,7 @@ export class Stage {
     this.invalidate();
   }
 
-  _label(tissues, ends) {
+  _label(tissues, ends, lesion) {
     for (const { element } of this._labels) element.remove();
     const below = ({ name }) => () => {
       const box = this.tissues.get(name)?.box() ?? null;
@@ -279,6 +286,7 @@ export class Stage {
     const named = [
       ...tissues.filter(({ label }) => label).map((tissue) => ({ text: tissue.label, kind: 'below', at: below(tissue) })),
       ...ends.map(({ text, place }) => ({ text, kind: 'above', at: () => place.clone() })),
+      ...(lesion === null ? [] : [{ text: 'still attached', kind: 'above', at: () => this.bridge.place }]),
     ];
     this._labels = named.map(({ text, kind, at }) => {
       const element = document.createElement('span');
