@@ -10,9 +10,10 @@ deeper by as much.
 
 Chosen, since no source gives them in these units: the novice's errors of place and depth, ten times
 the expert's; durations; pauses; how often a lump is recognised, or imagined. They were fixed before
-any score of these people was computed, and not changed after. That both see the bridge that still
-holds a lesion, and cut it, was added when attempts at `excision` with the seeds 2000 to 2019 were
-known, in which some lesions were left on one.
+any score of these people was computed, and not changed after. Both look for a bridge that still
+holds a lesion, and cut it, in place of the blind last cut of the script: this was added when
+attempts at `excision` with the seeds 2000 to 2019 were known; how they cut was chosen with experts
+of the seeds 1000 to 1013.
 """
 
 from dataclasses import dataclass, replace
@@ -66,9 +67,8 @@ _MEMORY = 0.7
 """Correlation of the errors at one waypoint and the next."""
 _PAUSE_SHARE = 0.03
 """Duration of a pause, as a share of the script."""
-_SEVERED_M = (-0.0025, 0.0045)
-"""Begin and end of a stroke through a bridge, outward from its middle [m]: as long as the one in
-the script of the scene `excision`."""
+_SEVERED_M = 0.006
+"""Way of a stroke through a bridge before and behind its middle [m]."""
 _LANES, _BORDER_M = 7, 0.008
 """Lanes of one who cuts everything, and how far beyond the scene's own way [m]."""
 
@@ -91,51 +91,58 @@ def person(scene: str, kind: Kind, seed: int) -> Person:
     random = np.random.default_rng([seed, sorted(SKILLS).index(kind)])
     touching = _touching_height(scene)
     slowness = skill.slowness * float(np.exp(skill.spread * random.normal()))
-    script = _with_errors(good.script, skill, touching, random)
-    script = script.model_copy(update={'seconds': good.script.seconds * slowness})
     hand = good.hand.model_copy(update={'tremor': skill.tremor / 3**0.5})
+    if kind not in SKILLED or scene_of(scene).exercise.lesion is None:
+        return Person(_with_errors(good.script, skill, touching, random, slowness), hand, seed)
+    sighted, blind = _without_last_cut(good.script), good.script
 
-    def sever(place: Floats, outward: Floats, seen: int) -> ScriptSettings:
+    def sever(place: Floats, along: Floats, seen: int) -> ScriptSettings:
         random = np.random.default_rng([seed, sorted(SKILLS).index(kind), seen])
-        way = _way_through(good.script, place, outward, slowness)
-        return _with_errors(way, skill, touching, random)
+        way = _way_through(blind, place, along, pressed=seen % 2 == 1)
+        return _with_errors(way, skill, touching, random, slowness)
 
-    return Person(script, hand, seed, sever if kind in SKILLED else None)
+    return Person(_with_errors(sighted, skill, touching, random, slowness), hand, seed, sever)
+
+
+def _without_last_cut(script: ScriptSettings) -> ScriptSettings:
+    """Return a script without its last cut, and the way to it: one that nobody looks for."""
+    last = max(k for k, phase in enumerate(script.phases) if phase.kind == 'cut')
+    kept = script.phases[: last - 1] + script.phases[last + 1 :]
+    share = sum(phase.share for phase in kept) / sum(phase.share for phase in script.phases)
+    return script.model_copy(update={'phases': kept, 'seconds': share * script.seconds})
 
 
 def _way_through(
-    script: ScriptSettings, place: Floats, outward: Floats, slowness: float
+    script: ScriptSettings, place: Floats, along: Floats, *, pressed: bool
 ) -> ScriptSettings:
-    """Return a stroke through tissue that still holds a lesion, from within outward.
+    """Return a stroke through tissue that still holds a lesion, as long as an expert takes.
 
-    The tissue outside is held, so it bears the bridge on the blade. Depth is that of the script.
+    It begins in the open cut and follows the border, so that it presses on no loose tissue. A
+    bridge that gives way to such a stroke is pressed down upon, and the stroke begins there.
 
     Args:
-        script: of the scene.
+        script: of the scene, which has the depths.
         place: of the tissue [m], shape (3,).
-        outward: direction from the lesion, shape (3,).
-        slowness: duration over that of an expert.
+        along: direction of the border, shape (3,).
+        pressed: whether the stroke begins on the bridge.
     """
     cuts = [phase for phase in script.phases if phase.kind == 'cut'][-1].waypoints
     deepest = min(point.position[2] for point in cuts)
     level, up = cuts[-1].position[2], script.start.position[2]
-    along = outward[:2] / np.linalg.norm(outward[:2])
+    direction = along[:2] / np.linalg.norm(along[:2])
 
     def at(beyond: float, height: float, share: float = 1.0) -> Waypoint:
-        x, y = place[:2] + beyond * along
+        x, y = place[:2] + beyond * direction
         return Waypoint(position=(float(x), float(y), height), share=share)
 
-    begin, end = _SEVERED_M
+    begin, end = (0.0 if pressed else -_SEVERED_M), _SEVERED_M
+    down = (at(begin, deepest, 2), at(begin, level)) if pressed else (at(begin, level),)
     phases = (
         Phase(kind='approach', share=1.5, waypoints=(at(begin, up),)),
-        Phase(
-            kind='cut',
-            share=3,
-            waypoints=(at(begin, deepest, 2), at(begin, level), at(end, level, 2)),
-        ),
+        Phase(kind='cut', share=3, waypoints=(*down, at(end, level, 2))),
         Phase(kind='retract', share=2, waypoints=(at(end, up), script.phases[-1].waypoints[-1])),
     )
-    seconds = slowness * sum(phase.share for phase in phases)
+    seconds = sum(phase.share for phase in phases)
     return script.model_copy(update={'seconds': seconds, 'phases': phases})
 
 
@@ -149,7 +156,11 @@ def _touching_height(scene: str) -> float:
 
 
 def _with_errors(
-    script: ScriptSettings, skill: Skill, touching: float, random: np.random.Generator
+    script: ScriptSettings,
+    skill: Skill,
+    touching: float,
+    random: np.random.Generator,
+    slowness: float,
 ) -> ScriptSettings:
     error = random.normal(size=3)
     places = sum(len(phase.waypoints) for phase in script.phases)
@@ -181,7 +192,8 @@ def _with_errors(
             before = point.position
             number += 1
         phases.append(phase.model_copy(update={'waypoints': tuple(points)}))
-    return script.model_copy(update={'phases': tuple(phases)})
+    seconds = slowness * script.seconds
+    return script.model_copy(update={'phases': tuple(phases), 'seconds': seconds})
 
 
 def _is_held(phase: Phase, point: Waypoint) -> bool:

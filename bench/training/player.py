@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cutting_trainer.exercises.bag_feed import MOTION_FIELDS
 from cutting_trainer.exercises.metrics import Attempt
+from cutting_trainer.exercises.scene_schema import TargetSettings
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
 from cutting_trainer.haptic_bridge.emulated_arm.hand import (
     EmulatedHand,
@@ -33,8 +34,8 @@ class Person:
         script: its motion, in the tissue frame.
         hand: stiffness, damping, tremor.
         seed: of the tremor.
-        sever: returns a script through a bridge that it sees, from place [m] and outward
-            direction, each shape (3,), and how many it has seen; None: it does not look.
+        sever: returns a script through a bridge that it sees, from its place [m] and the direction
+            of the target there, each shape (3,), and how many it has seen; None: it does not look.
     """
 
     script: ScriptSettings
@@ -77,16 +78,24 @@ def play(scene: str, person: Person) -> Attempt:
     attempt = Attempt(said.exercise)
     begun = _perform(world, arm, attempt, 0, script.seconds)
     for looks in range(MAX_LOOKS):
-        if person.sever is None or attempt.bridge is None or said.exercise.lesion is None:
+        if person.sever is None or attempt.bridge is None:
             break
         edge = list(attempt.bridge)
-        outward = mesh.rest[edge].mean(axis=0) - said.exercise.lesion.centre
         seen = world.tissue.simulation.positions[edge].mean(axis=0)
+        along = _direction(said.exercise.targets[0], mesh.rest[edge].mean(axis=0))
         here = script.phases[-1].waypoints[-1]
-        script = person.sever(seen, outward, looks).model_copy(update={'start': here})
+        script = person.sever(seen, along, looks).model_copy(update={'start': here})
         hand.script, arm.script_time = _in_device(said, script), 0.0
         begun = _perform(world, arm, attempt, begun, script.seconds)
     return attempt
+
+
+def _direction(target: TargetSettings, place: Floats) -> Floats:
+    """Return the direction of a target nearest to a place, shape (3,)."""
+    corners = target.corners()
+    ways = np.diff(corners, axis=0)
+    middles = 0.5 * (corners[1:] + corners[:-1])
+    return np.asarray(ways[np.linalg.norm(middles - place, axis=1).argmin()])
 
 
 def _in_device(scene: Scene, script: ScriptSettings) -> HandScript:
