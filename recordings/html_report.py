@@ -105,7 +105,7 @@ def _body(
 ) -> str:
     script = scene.arm.script if scene else None
     tool = story.tool[::_SAMPLE_STRIDE]
-    depth = SurfaceDepth(before).depths(tool[:, 7:10])
+    depth = SurfaceDepth(before).depths(tool[:, 4:10].reshape(-1, 2, 3))
     begun = datetime.fromtimestamp(first_time(bag) * 1e-9, UTC)
     data = bag.custom_data
     about = ', '.join(

@@ -13,6 +13,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from multiprocessing import get_context
 
+import numpy as np
+
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
@@ -25,8 +27,9 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     Transform,
 )
 from cutting_trainer.haptic_bridge.warm_up import warm_up as warm_up_force_path
+from cutting_trainer.tissue_sim.mesh.depth import depths_behind_entry
+from cutting_trainer.tissue_sim.warm_up import small_cube, warm_up_method
 from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
-from cutting_trainer.tissue_sim.warm_up import warm_up_method
 
 
 def main() -> None:
@@ -70,6 +73,12 @@ def warm_up_arm() -> None:
     arm.advance(3_000_000, enabled=True)
 
 
+def warm_up_gauge() -> None:
+    """Compute the depth of a blade, as pages and reports do."""
+    cube = small_cube()
+    depths_behind_entry(np.zeros((1, 2, 3)), cube.rest, cube.triangles)
+
+
 # The longest first: each processor takes the next one.
 DEMO: dict[str, Callable[[], None]] = {
     'tissue': partial(warm_up_method, 'symplectic_euler'),
@@ -80,6 +89,7 @@ DEMO: dict[str, Callable[[], None]] = {
 FURTHER: dict[str, Callable[[], None]] = {
     'tissue by all integrators': warm_up_tissue,
     'cutting by deletion': partial(warm_up_cutting, CuttingSettings(method='delete')),
+    'depth of a blade': warm_up_gauge,
 }
 
 

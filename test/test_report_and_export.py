@@ -60,11 +60,27 @@ def test_the_length_of_an_incision_is_half_of_its_lips() -> None:
     assert surface_length(opened) == pytest.approx(0.5 * 4 * 0.02)
 
 
-def test_depth_is_the_distance_under_the_free_surface() -> None:
-    points = np.array([[0.02, 0.01, 0.017], [0.02, 0.01, 0.025], [0.02, 0.0115, 0.001]])
+def test_depth_is_the_distance_of_the_blades_end_from_the_surface_that_it_enters() -> None:
+    upright = np.array([[0.02, 0.01, 0.04], [0.02, 0.01, 0.017]])
+    above, low, through = upright.copy(), upright.copy(), upright.copy()
+    above[1, 2], low[1, 2], through[1, 2] = 0.025, 0.001, -0.004
+    tilted = np.array([[0.0371, 0.0113, 0.03], [0.0171, 0.0133, 0.014]])
+    within = np.array([[0.02, 0.01, 0.015], [0.02, 0.0115, 0.001]])
+    from_below = np.array([[0.02, 0.01, -0.01], [0.02, 0.01, -0.004]])
+    blades = np.array([upright, above, low, through, tilted, within, from_below])
     np.testing.assert_allclose(
-        SurfaceDepth(block_of()).depths(points), [0.003, 0.0, 0.0085], atol=1e-12
+        SurfaceDepth(block_of()).depths(blades),
+        [0.003, 0.0, 0.019, 0.024, 0.006, 0.0085, 0.0],
+        atol=1e-12,
     )
+
+
+def test_depth_grows_with_the_way_of_a_blade_through_a_thin_sheet() -> None:
+    ends = np.linspace(0.03, -0.01, 41)
+    blades = np.tile([[0.013, 0.0071, 0.05], [0.013, 0.0071, 0.0]], (len(ends), 1, 1))
+    blades[:, 1, 2] = ends
+    depths = SurfaceDepth(block_of()).depths(blades)
+    np.testing.assert_allclose(depths, np.maximum(0.02 - ends, 0.0), atol=1e-12)
 
 
 def test_distance_to_the_plan_is_seen_from_above() -> None:

@@ -232,7 +232,7 @@ class LivePage:
     def _depth(self, moment: Moment) -> float:
         if self._gauge is None:
             return 0.0
-        return float(self._gauge.depths(moment.blade[1:])[0])
+        return float(self._gauge.depths(moment.blade[None])[0])
 
     def _plot(self) -> None:
         rows = self._history.rows()[::-_EVERY][::-1]

@@ -52,7 +52,8 @@ class Recording:
     @cached_property
     def depths(self) -> Floats:
         """Return the depth of the blade's end at each contact [m], shape (n,)."""
-        return SurfaceDepth(self.tissue.go_to(0.0)).depths(self.track.contact.vectors('blade_tip'))
+        blades = [self.track.contact.vectors(end) for end in ('blade_root', 'blade_tip')]
+        return SurfaceDepth(self.tissue.go_to(0.0)).depths(np.stack(blades, axis=1))
 
     @property
     def felt(self) -> tuple[Floats, Floats]:
