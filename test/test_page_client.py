@@ -533,6 +533,16 @@ def test_exercise_is_read_at_every_size_and_stands_beside_the_picture(
         assert page.says('start') and page.says('end')
 
 
+def test_the_place_that_still_holds_a_lesion_is_ringed_until_it_is_cut(browser: Browser) -> None:
+    stand_in = StandIn('excision')
+    with closing(stand_in), opened(browser, stand_in) as page:
+        assert page.state()['bridge'] is None and not page.says('still attached')
+        for place in ([0.016, 0.0, 0.004], [0.0, 0.011, 0.002], None):
+            stand_in.server.put('attempt', rows=[], score=None, bridge=place)
+            page.wait(lambda place=place: page.state()['bridge'] == place, 'the ring')
+            page.wait(lambda place=place: page.says('still attached') == bool(place), 'the label')
+
+
 def test_exercise_is_begun_for_a_subject_and_two_attempts_are_opened_side_by_side(
     browser: Browser,
 ) -> None:
