@@ -15,6 +15,8 @@ from cutting_trainer.node_common.output import HEARTBEAT, Outlet
 from cutting_trainer.session.parent_death_signal import bound
 
 MAX_TAIL_LINES = 6
+_CRASH = 'Fatal Python error'
+"""How `faulthandler` begins."""
 MAX_LINE_BYTES = 1 << 16
 CUT_OFF = f' (cut off: longer than {MAX_LINE_BYTES} bytes)'
 MAX_READS = 16
@@ -103,7 +105,7 @@ class NodeProcess:
     """A node that was started, and the state that it has reported.
 
     Attributes:
-        tail: last lines of its output.
+        tail: last lines of its output; those of a crash from its first on.
         ready, done: it has reported so.
         asked_to_end: its end is expected from now on.
         output_closed: it has closed its output.
@@ -190,6 +192,15 @@ class NodeProcess:
             os.killpg(self.process.pid, number)
         except (ProcessLookupError, PermissionError):
             self.send(number)
+
+    def remember(self, line: str) -> None:
+        """Put a line of the output into the tail."""
+        crashed = bool(self.tail) and self.tail[0].startswith(_CRASH)
+        if not line or (crashed and len(self.tail) == MAX_TAIL_LINES):
+            return
+        if line.startswith(_CRASH):
+            self.tail.clear()
+        self.tail.append(line)
 
     def lines(self) -> Iterator[str]:
         """Yield the complete lines that have arrived, and the beginning of a line that is too long.

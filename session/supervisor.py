@@ -311,8 +311,7 @@ class Supervisor:
                 node.beat = self._lived
                 continue
             node.log.write(line)
-            if line:
-                node.tail.append(line)
+            node.remember(line)
             self._interpret(node, line)
         if node.output_closed:
             self._selector.unregister(node.pipe)
@@ -356,7 +355,8 @@ class Supervisor:
         """Register the end of a process, which is a death or was requested."""
         status = node.process.returncode
         if node.asked_to_end and status not in EXPECTED_STATUSES:
-            text = f'{node.name} did not end well ({describe(status)}), see its log'
+            said = f'; it said last: {" / ".join(node.tail)}'
+            text = f'{node.name} did not end well ({describe(status)}){said}'
             self._emit(Event('warning', node.name, text))
         if node.asked_to_end or (node.done and status == 0):
             return

@@ -5,9 +5,10 @@ deaf (ignores SIGINT and SIGTERM), done (says `done` soon), slow (ends 0.3 s aft
 dies (exit status 7 before it is ready), refuses (the same with 2, as a node does whose scene is
 bad), asks (the launcher, and repeats its answer), falls (killed by a signal soon after it is
 ready), parent (starts a process of its own), garbles (says messages that nobody can read), beats
-(gives signs of life).
+(gives signs of life), crashes (by a wrong access to memory as it ends).
 """
 
+import faulthandler
 import os
 import signal
 import subprocess
@@ -61,6 +62,9 @@ def main(name: str, ledger: str, *habits: str) -> None:
             print(f'beat: {name}')
     if 'slow' in habits:
         time.sleep(0.3)
+    if 'crashes' in habits:
+        faulthandler.enable()
+        os.kill(os.getpid(), signal.SIGSEGV)
     note('end')
 
 

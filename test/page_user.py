@@ -16,6 +16,8 @@ from bench.page.browser import Page
 ROOT = Path(__file__).resolve().parents[1]
 REACHED_M = 0.003
 """[m] beside a place where the blade is over it."""
+YIELDED_M, YIELDED_S = 0.006, 2.0
+"""[m] beside the end of a stroke, and [s], where the tissue holds the hand back: 1.5 N by 4 mm."""
 
 
 def sessions() -> set[Path]:
@@ -113,7 +115,17 @@ def cut(page: Page, places: np.ndarray, notches: int = 0) -> None:
     for pixel in pixels[1:]:
         page.mouse('mouseMoved', *pixel, pressed=True)
         time.sleep(0.1)
-    page.wait(lambda: off(page, places[-1]) < REACHED_M, 'the end of the stroke')
+    near: list[float] = []  # since when
+
+    def ended() -> bool:
+        beside = off(page, places[-1])
+        if beside >= YIELDED_M:
+            near.clear()
+        elif not near:
+            near.append(time.monotonic())
+        return beside < REACHED_M or (bool(near) and time.monotonic() - near[0] > YIELDED_S)
+
+    page.wait(ended, 'the end of the stroke')
     time.sleep(0.7)
 
 

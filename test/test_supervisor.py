@@ -179,6 +179,17 @@ def test_node_that_ignores_signals_is_killed_after_its_grace(
     assert not ledger.running()
 
 
+def test_a_node_that_crashes_at_its_end_says_where(tmp_path: Path, ledger: Ledger) -> None:
+    said: list[Event] = []
+    nodes = [command('cutting', ledger, 'crashes')]
+    with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT, said.append) as supervisor:
+        assert supervisor.start()
+        supervisor.end()
+    (sentence,) = [event.text for event in said if 'did not end well' in event.text]
+    assert 'killed by SIGSEGV' in sentence
+    assert 'Fatal Python error: Segmentation fault' in sentence and 'in main' in sentence
+
+
 def test_frozen_node_does_not_outlive_the_session(tmp_path: Path, ledger: Ledger) -> None:
     nodes = [command('cutting', ledger, grace=0.2)]
     with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:

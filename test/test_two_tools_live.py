@@ -23,6 +23,7 @@ from live import (
     node_words,
     phase,
     wait_for,
+    worst_gap,
     write_scene,
     zero_from,
 )
@@ -48,6 +49,8 @@ SECONDS = 9.0
 OTHER = (0.012, 0.008)
 TOUCHED, LIFTED = 0.0110, 0.0220
 """Heights of the tips [m]; the surface is at 10 mm and the radius 4 mm."""
+DRIVER_DEADLINE = 0.030
+"""[s] after which the bridge of a driver that has died commands no force."""
 NAMES = ('emulated_arm', 'haptic_bridge')
 RATE = 500.0
 """[Hz] of arms and bridges: four loops of 1 kHz and their recorder take more than two slow cores.
@@ -212,6 +215,9 @@ def test_when_one_arm_or_bridge_dies_the_other_tool_goes_on(
     if node == 'emulated_arm':  # its bridge is in FAULT
         others, zero = recording.force('/grasper' + SERVO_CF)
         assert others[-1] > at + 1.0
-        assert zero_from(others, zero) < at + 1.0
+        delay = worst_gap(others, at - 0.1, at + 0.3)
+        after = zero_from(others, zero) - at
+        print(f'no force after {1e3 * after:.1f} ms, scheduling delay {1e3 * delay:.1f} ms')
+        assert after <= DRIVER_DEADLINE + delay
     frames, state = recording.read('/grasper/tissue/force', ForceSampleCodec(), 'state')
     assert not state[frames > at + 1.0].any()  # the jaws have let go

@@ -15,10 +15,6 @@ SETTLED_S = 2.0
 HEIGHT_MM, TIP_MM = 4, 4
 """Height of the blade's end over the surface without a cut, and of the tip over that."""
 _STEP_S = 0.1
-_MAX_LOOKS = 3
-"""How often a good trainee cuts what the page says is still attached."""
-_SEVERED_M = (-0.0025, 0.0045)
-"""Begin and end of such a stroke, from the middle outward [m]."""
 
 
 @dataclass(frozen=True)
@@ -47,20 +43,12 @@ def presses(*places: tuple[float, float]) -> list[np.ndarray]:
     return [np.array([[x, y, 0.024]]) for x, y in places]
 
 
-def ring(radii: tuple[float, float], height: float, turns: float, count: int = 48) -> np.ndarray:
-    """Places along an ellipse around the middle, at a height [m]."""
+def ring(radius: float, height: float, turns: float, count: int = 48) -> np.ndarray:
+    """Places along a circle around the middle, at a height [m]."""
     angles = 2 * np.pi * np.linspace(0.0, turns, count)
     return np.column_stack(
-        [radii[0] * np.cos(angles), radii[1] * np.sin(angles), np.full(count, height)]
+        [radius * np.cos(angles), radius * np.sin(angles), np.full(count, height)]
     )
-
-
-def through(place: Sequence[float], height: float) -> np.ndarray:
-    """A stroke through tissue that is still attached, away from the middle [m], shape (n, 3)."""
-    where = np.array(place)[:2]
-    along = where / np.linalg.norm(where)
-    begin, end = (np.array([*(where + off * along), height]) for off in _SEVERED_M)
-    return np.linspace(begin, end, 12)
 
 
 OPENED, MARKED = 'target that is opened', 'lumps marked'
@@ -76,14 +64,14 @@ EXERCISES = {
         OPENED,
         notches=4,
     ),
-    'circle': Exercise(
-        [ring((0.02625, 0.02625), 0.004, 1.05)],
-        [ring((0.02625, 0.02625), 0.004, 0.5)],
+    'pad': Exercise(
+        [line((-0.018, 0, 0.014), (0.0285, 0, 0.014))],
+        [line((-0.018, 0, 0.014), (0, 0, 0.014))],
         OPENED,
     ),
-    'excision': Exercise(
-        [ring((0.01696, 0.01144), 0.004, 1.05)],
-        [ring((0.01696, 0.01144), 0.004, 0.5)],
+    'circle': Exercise(
+        [ring(0.02625, 0.004, 1.05)],
+        [ring(0.02625, 0.004, 0.5)],
         OPENED,
     ),
 }  # fmt: skip
@@ -101,10 +89,6 @@ def attempt(page: Page, exercise: str, skill: str, subject: str) -> str:
     how = EXERCISES[exercise]
     for number, stroke in enumerate(getattr(how, skill)):
         _stroke(page, stroke, how.notches if number == 0 else 0)
-    for _ in range(_MAX_LOOKS if skill == 'good' else 0):
-        if (place := page.state()['bridge']) is None:
-            break
-        _stroke(page, through(place, how.good[0][0, 2]))
     _return(page, exercise)
     said = "document.querySelector('#task-score:not([hidden])')?.innerText"
     return str(page.wait(lambda: page.evaluate(said), 'the score', TIMEOUT_S))
