@@ -218,10 +218,10 @@ class LiveSession:
             time.sleep(0.01)
         assert text in self.said, self.said
 
-    def wait_until_pressed(self, least: float) -> None:
-        """Returns when the force on the hand [N] has stayed above a value for a while."""
+    def wait_until_pressed(self, least: float, tool: str = '') -> None:
+        """Returns when the force on the hand of a tool [N] has stayed above a value for a while."""
         rest = -np.inf
-        with onlooker(self.domain) as forces:
+        with onlooker(self.domain, topic=tool + SERVO_CF) as forces:
 
             def pressed() -> bool:
                 nonlocal rest
