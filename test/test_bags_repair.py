@@ -3,7 +3,6 @@
 import json
 import os
 import resource
-import struct
 from pathlib import Path
 
 import pytest
@@ -12,8 +11,9 @@ from mcap.opcode import Opcode
 from test_bags import add_topics, some_messages, write_all
 
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.mcap.chunks import Unpacked
+from cutting_trainer.bags.mcap.chunks import MESSAGE_HEAD, Unpacked
 from cutting_trainer.bags.mcap.damaged_chunk import behind, prefix
+from cutting_trainer.bags.mcap.records import HEAD
 from cutting_trainer.bags.metadata import read_metadata
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.repair import repair_bag, repair_note
@@ -23,7 +23,6 @@ from cutting_trainer.recordings.repair_command import account_lines, repair
 pytestmark = pytest.mark.long
 
 MESSAGES = some_messages(500)
-_MESSAGE_HEAD = struct.Struct('<BQ')
 
 
 @pytest.fixture
@@ -106,9 +105,9 @@ def test_a_chunk_that_cannot_be_unpacked_costs_its_own_messages_only(folder: Pat
 
 
 def test_messages_whose_lengths_are_damaged_end_where_the_index_has_the_next_one() -> None:
-    told, body = _MESSAGE_HEAD.pack(Opcode.MESSAGE, 8602), MESSAGES[0].data
+    told, body = HEAD.pack(Opcode.MESSAGE, 8602), MESSAGES[0].data
     times = [1000 + k for k in range(10)]
-    records = [told + struct.pack('<HIQQ', 3, k, time, time) + body for k, time in enumerate(times)]
+    records = [told + MESSAGE_HEAD.pack(3, k, time, time) + body for k, time in enumerate(times)]
     counted = [(3, time, k * len(records[0])) for k, time in enumerate(times)]
     data = b''.join(records)
     assert prefix(data) == ([], False)

@@ -88,16 +88,12 @@ def attempt(page: Page, exercise: str, skill: str, subject: str) -> str:
     start(page)
     how = EXERCISES[exercise]
     for number, stroke in enumerate(getattr(how, skill)):
-        _stroke(page, stroke, how.notches if number == 0 else 0)
+        cut(page, stroke, how.notches if number == 0 else 0)
+        page.mouse('mouseReleased', *page.pixels(stroke[-1:])[0])
+        time.sleep(SETTLED_S)
     _return(page, exercise)
     said = "document.querySelector('#task-score:not([hidden])')?.innerText"
     return str(page.wait(lambda: page.evaluate(said), 'the score', TIMEOUT_S))
-
-
-def _stroke(page: Page, places: np.ndarray, notches: int = 0) -> None:
-    cut(page, places, notches)
-    page.mouse('mouseReleased', *page.pixels(places[-1:])[0])
-    time.sleep(SETTLED_S)
 
 
 def _return(page: Page, exercise: str) -> None:

@@ -35,7 +35,8 @@ MAX_FILE_RATIO = 100
 SMALL_FILE = 1 << 26
 
 _HEAD = struct.Struct('<BQ')
-_MESSAGE = struct.Struct('<HIQQ')
+MESSAGE_HEAD = struct.Struct('<HIQQ')
+"""Channel, sequence, log time and publish time, before the data of a message."""
 _PIECE = 1 << 16
 
 McapRecord = Schema | Channel | Message
@@ -185,10 +186,10 @@ def read_record(opcode: int, body: bytes) -> McapRecord | None:
         ChunkError: it is damaged, or a definition is longer than it may be.
     """
     if opcode == Opcode.MESSAGE:
-        if len(body) < _MESSAGE.size:
+        if len(body) < MESSAGE_HEAD.size:
             raise ChunkError(f'a message of {len(body)} bytes has no head')
-        channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(body)
-        return Message(channel, log_time, body[_MESSAGE.size :], publish_time, sequence)
+        channel, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(body)
+        return Message(channel, log_time, body[MESSAGE_HEAD.size :], publish_time, sequence)
     if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
         return None
     if len(body) > MAX_DEFINITION:

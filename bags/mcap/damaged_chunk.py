@@ -9,6 +9,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, Message
 
 from cutting_trainer.bags.mcap.chunks import (
+    MESSAGE_HEAD,
     ChunkError,
     McapRecord,
     Unpacked,
@@ -27,8 +28,6 @@ _PACKED = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 _NAMES = ('', *_PACKED.values())
 _FIXED = struct.Struct('<QQQI')
 _LENGTH = struct.Struct('<Q')
-_MIN_MESSAGE = 22
-"""Bytes of a message before its data."""
 
 
 def inner_length(body: bytes) -> int | None:
@@ -87,7 +86,7 @@ def behind(
 ) -> list[McapRecord]:
     """Return messages behind damage within a chunk: those in an index.
 
-    A message that says it is longer than its place ends where the next one begins.
+    A message that says it is longer than the chunk ends where the next one in the index begins.
 
     Args:
         unpacked: the chunk.
@@ -105,9 +104,10 @@ def behind(
         if len(head) < HEAD.size or head[0] != Opcode.MESSAGE:
             continue
         begin = at + HEAD.size
-        end = min(begin + HEAD.unpack(head)[1], after)
+        end = begin + HEAD.unpack(head)[1]
+        end = end if end <= len(data) else after
         body = data[begin:end]
-        if len(body) != end - begin or len(body) < _MIN_MESSAGE:
+        if len(body) != end - begin or len(body) < MESSAGE_HEAD.size:
             continue
         message = read_record(Opcode.MESSAGE, body)
         assert isinstance(message, Message)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.stream_reader import StreamReader
 
@@ -26,6 +27,8 @@ from cutting_trainer.bags.writer import BagWriter
 KINDS = ('bit', 'bytes', 'cut off', 'cut out', 'repeated', 'record twice', 'record lost', 'clock')
 CLOCK_STEPS_NS = (-1_000_000_000, -50_000_000, 1_000_000_000, 3_600_000_000_000)
 """Steps of the clock [ns]."""
+_NEXT_MESSAGE = bytes([Opcode.MESSAGE])
+"""First byte of the record of a message."""
 Messages = Counter[tuple[int, bytes]]
 """Log time and data, with how often they are there."""
 
@@ -213,7 +216,7 @@ def _missing(heard: Messages, kept: Messages) -> int:
     """
     begins: dict[int, list[bytes]] = {}
     for time, data in kept:
-        begins.setdefault(time, []).extend([data] if data else [])
+        begins.setdefault(time, []).append(data + _NEXT_MESSAGE)
     return sum(
         not any(data.startswith(begin) for begin in begins.get(time, ()))
         for time, data in heard.keys() - kept.keys()

@@ -12,7 +12,7 @@ const EDGE = 0.0004; // [m] line around an area
 const DASH = 0.0032, GAP = 0.0018; // [m] of a target's line
 const PATTERN = 0.0022; // [m] period of hatching and dots
 const RING = 0.00025; // [m] radius of a ring's wire
-const BRIDGE = 0.0014; // [m] half the radius of the ring around what holds a lesion
+const BRIDGE = 0.0028; // [m] radius of the ring around what holds a lesion
 
 /**
  * The ink on the tissue, seen along z, as a texture by x and y at rest [m]; null: there is none.
@@ -147,7 +147,7 @@ function dots(context) {
 export class Bridge {
   constructor(scene) {
     const material = new MeshBasicMaterial({ color: ATTACHED, depthTest: false, transparent: true });
-    this._ring = new Mesh(new TorusGeometry(2 * BRIDGE, BRIDGE / 4, 6, 32), material);
+    this._ring = new Mesh(new TorusGeometry(BRIDGE, BRIDGE / 8, 6, 32), material);
     this._ring.renderOrder = 4;
     this._ring.visible = false;
     scene.add(this._ring);
