@@ -193,10 +193,14 @@ class NodeProcess:
         except (ProcessLookupError, PermissionError):
             self.send(number)
 
+    @property
+    def crashed(self) -> bool:
+        """Return whether the tail is the report of a crash."""
+        return bool(self.tail) and self.tail[0].startswith(_CRASH)
+
     def remember(self, line: str) -> None:
         """Put a line of the output into the tail."""
-        crashed = bool(self.tail) and self.tail[0].startswith(_CRASH)
-        if not line or (crashed and len(self.tail) == MAX_TAIL_LINES):
+        if not line or (self.crashed and len(self.tail) == MAX_TAIL_LINES):
             return
         if line.startswith(_CRASH):
             self.tail.clear()
