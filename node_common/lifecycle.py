@@ -223,6 +223,15 @@ class ManagedNode(LifecycleNode):
         if self._before:
             self.release()
 
+    def destroy_node(self) -> None:
+        """Destroy the node with its state machine, which holds the participant of the middleware.
+
+        No collector frees it in time: it is part of a cycle, and frozen. A thread of the
+        participant that outlives the interpreter reads what the end of the process destroys.
+        """
+        super().destroy_node()
+        self.__dict__.pop('_state_machine', None)
+
     def _destroy(self) -> None:
         """Destroy the entities made since `configure` was called."""
         for kind in _OWNED:

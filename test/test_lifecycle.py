@@ -138,3 +138,34 @@ def test_a_bridge_that_rests_leaves_no_force_and_comes_back_without_one(managers
     bridge.change(Transition.TRANSITION_ACTIVATE)
     raw = wait_for(lambda: take_raw(forces), 'commands of a bridge that works again')
     assert not any(WrenchStampedCodec().decode(raw).values)
+
+
+ENDS = """
+import os, signal, threading
+from cutting_trainer.node_common.lifecycle import ManagedNode, run
+
+def sockets():
+    rows = open('/proc/self/net/udp').read().splitlines()[1:]
+    udp = {f'socket:[{row.split()[9]}]' for row in rows}
+    links = [f'/proc/self/fd/{number}' for number in os.listdir('/proc/self/fd')]
+    return sum(os.readlink(at) in udp for at in links if os.path.islink(at))
+
+class Lives(ManagedNode):
+    def work(self, stop):
+        print(f'{sockets()} sockets at work')
+        os.kill(os.getpid(), signal.SIGINT)
+        stop.wait()
+
+run(lambda: Lives('lives'))
+print(f'{sockets()} sockets at the end')
+"""
+
+
+def test_no_thread_of_the_middleware_outlives_a_node() -> None:
+    """One that does reads what the end of the process destroys: a node died of SIGSEGV so."""
+    command = [sys.executable, '-c', ENDS]
+    done = subprocess.run(
+        command, cwd=ROOT, env=node_environment(free_domain()), capture_output=True, text=True
+    )
+    work, end = (int(line.split()[0]) for line in done.stdout.splitlines() if 'sockets' in line)
+    assert work > 0 and end == 0, done
