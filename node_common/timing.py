@@ -182,6 +182,10 @@ def request_preference(niceness: int) -> str:
     This is for work with a deadline that may occupy a processor for longer than a real-time thread
     should. Receiving threads are included: a frame waits for the answers that they receive.
 
+    Where the kernel shares processors between terminals and desktops first, a niceness counts only
+    among processes of the same one (sched(7), "The autogroup feature"). The group of this process
+    is therefore preferred to the others, a browser's for example; its processes share that.
+
     Args:
         niceness: below 0.
 
@@ -197,4 +201,6 @@ def request_preference(niceness: int) -> str:
             'no preference over other processes is allowed for this user: allow it with "nice -20" '
             'in /etc/security/limits.d and log in again'
         )
+    with contextlib.suppress(OSError):  # not by this kernel, or set a moment ago
+        Path('/proc/self/autogroup').write_text(str(FRAME_NICENESS))
     return f'preferred to other processes: niceness {niceness}'
