@@ -6,13 +6,15 @@ Run `python test/page_world.py [--replay] [--port 8080]` to look at the page wit
 import argparse
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from bench.page.browser import Browser, Page
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.viewer import plots
@@ -45,6 +47,9 @@ PERIOD = 1 / 30
 SPEED = 0.3
 """[m/s] of the hand."""
 DOWN = 0.7071067811865476
+WATCH = """window.broken = [];
+document.addEventListener('securitypolicyviolation', e => window.broken.push(e.blockedURI));
+window.addEventListener('error', e => window.broken.push(e.message));"""
 ATTEMPTS: list[dict[str, Any]] = [
     {
         'bag': f'circle-{number}',
@@ -69,17 +74,25 @@ class StandIn:
         scene: of the tissue.
         mode: live or replay.
         port: to serve at; 0: a free one.
+        slope: of the tissue along x.
         says: what nodes and session say, by type.
     """
 
     def __init__(
-        self, scene: str = 'liver', mode: Any = 'live', port: int = 0, **says: dict[str, Any]
+        self,
+        scene: str = 'liver',
+        mode: Any = 'live',
+        port: int = 0,
+        slope: float = 0.0,
+        **says: dict[str, Any],
     ) -> None:
         self.asked: list[AnyMessage] = []
         self._scene = load_scene(scene)
         simulation = make_simulation(self._scene.tissue)[0]
         mesh = simulation.mesh
         positions = np.array(simulation.positions)
+        self._top, self._slope = float(positions[:, 2].max()), slope
+        positions[:, 2] += slope * positions[:, 0]
         self.positions = positions
         self._tissue = SimpleNamespace(
             rest=positions,
@@ -129,6 +142,10 @@ class StandIn:
         """Moves the whole tissue along y [m]."""
         self._tissue.displacement[:, 1] = along
         self._tissue.revision += 1
+
+    def on_top(self, x: float, y: float) -> np.ndarray:
+        """A place on the upper side of the tissue [m]."""
+        return np.array([x, y, self._top + self._slope * x])
 
     def of(self, kind: type) -> list[Any]:
         """What was asked for, of one kind."""
@@ -221,8 +238,8 @@ class StandIn:
         way = self.goal - self.tip
         length = float(np.linalg.norm(way))
         self.tip = self.tip + way * min(1.0, SPEED * PERIOD / max(length, 1e-9))
-        top = self.positions[:, 2].max()
-        depth = max(0.0, float(top - self.tip[2]))
+        top = float(self.on_top(*self.tip[:2])[2])
+        depth = max(0.0, top - float(self.tip[2]))
         self._bend(depth)
         if self._mode == 'live':
             self._show_session(now, depth)
@@ -234,7 +251,7 @@ class StandIn:
             'moment',
             tip=self.tip.tolist(),
             wxyz=[1.0, 0.0, 0.0, 0.0],
-            proxy=[*self.tip[:2].tolist(), max(float(self.tip[2]), float(top))],
+            proxy=[*self.tip[:2].tolist(), max(float(self.tip[2]), top)],
             force=force,
             depth=depth,
             can_guide=self.state == 'ENABLED',
@@ -315,6 +332,31 @@ class StandIn:
             plots.RATES.lines(times, 100 + np.sin(9 * moving), 98 + 3 * np.sin(5 * moving)),
         ]
         self.server.put('plots', span=span, lines=lines)
+
+
+@contextmanager
+def opened(browser: Browser, stand_in: StandIn) -> Iterator[Page]:
+    """A page on a session, with its picture."""
+    with closing(stand_in):
+        page = browser.page()
+        page.call('Page.addScriptToEvaluateOnNewDocument', source=WATCH)
+        page.open(stand_in.url)
+        page.wait(lambda: page.state().get('tip') and page.state()['meshes'], 'the page')
+        yield page
+        assert page.evaluate('window.broken') == []
+        page.open('about:blank')
+
+
+def guided(page: Page) -> np.ndarray:
+    """Lets the force in; where the blade is in the window then [pixel]."""
+    page.press('start')
+    page.wait(lambda: page.state()['canGuide'], 'the hand')
+    return np.array(page.state()['tip'])
+
+
+def key(page: Page, code: str, name: str) -> None:
+    for kind in ('keyDown', 'keyUp'):
+        page.call('Input.dispatchKeyEvent', type=kind, code=code, key=name)
 
 
 def main() -> None:

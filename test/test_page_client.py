@@ -6,20 +6,18 @@ The server is the real one; behind it is a session that is none (page_world.py).
 import json
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from page_world import StandIn
+from page_world import StandIn, guided, key, opened
 
 from bench.page.browser import CHROMIUM, Browser, Page, chromium
-from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.viewer.page_protocol import (
     Attempt,
     EStop,
-    Guide,
     Play,
     ResetEStop,
     Seek,
@@ -33,12 +31,8 @@ pytestmark = [
     ),
 ]
 
-UP = np.array([0.0, 0.0, 1.0])
 SIZES = ((390, 844), (820, 1180), (1280, 800), (2560, 1440), (844, 390))
 EVIL = '<img src=x onerror="window.evil=1"><script>window.evil=2</script>'
-WATCH = """window.broken = [];
-document.addEventListener('securitypolicyviolation', e => window.broken.push(e.blockedURI));
-window.addEventListener('error', e => window.broken.push(e.message));"""
 WHAT_IS_THERE = """(() => {
     const r = document.querySelector('#e-stop').getBoundingClientRect();
     const shares = [0.05, 0.5, 0.95];
@@ -52,19 +46,6 @@ WHAT_IS_THERE = """(() => {
 def browser() -> Iterator[Browser]:
     with chromium((1000, 700)) as browser:
         yield browser
-
-
-@contextmanager
-def opened(browser: Browser, stand_in: StandIn) -> Iterator[Page]:
-    """A page on a session, with its picture."""
-    with closing(stand_in):
-        page = browser.page()
-        page.call('Page.addScriptToEvaluateOnNewDocument', source=WATCH)
-        page.open(stand_in.url)
-        page.wait(lambda: page.state().get('tip') and page.state()['meshes'], 'the page')
-        yield page
-        assert page.evaluate('window.broken') == []
-        page.open('about:blank')
 
 
 REACHED = """(() => {
@@ -108,22 +89,10 @@ def test_every_control_is_reached_and_none_covers_the_tissue_at_every_size(
         assert page.evaluate('document.documentElement.lang') == 'en'
 
 
-def key(page: Page, code: str, name: str) -> None:
-    for kind in ('keyDown', 'keyUp'):
-        page.call('Input.dispatchKeyEvent', type=kind, code=code, key=name)
-
-
 def stop_by_key(page: Page, stand_in: StandIn, code: str, name: str) -> None:
     before = len(stand_in.of(EStop))
     key(page, code, name)
     stand_in.wait(lambda: len(stand_in.of(EStop)) > before)
-
-
-def guided(page: Page) -> np.ndarray:
-    """Lets the force in; where the blade is in the window then [pixel]."""
-    page.press('start')
-    page.wait(lambda: page.state()['canGuide'], 'the hand')
-    return np.array(page.state()['tip'])
 
 
 def test_e_stop_arrives_by_mouse_and_by_key_and_is_in_sight_at_every_size(browser: Browser) -> None:
@@ -148,260 +117,6 @@ def test_e_stop_arrives_by_mouse_and_by_key_and_is_in_sight_at_every_size(browse
             page.evaluate("document.querySelector('#pause').focus()")  # which Space would press
             stop_by_key(page, stand_in, code, name)
         assert not [message for message in stand_in.asked if message.op == 'pause']
-
-
-def on_top(stand_in: StandIn, x: float, y: float) -> np.ndarray:
-    """A place on the upper side of the block [m]."""
-    return np.array([x, y, stand_in.positions[:, 2].max()])
-
-
-def hovering(page: Page, stand_in: StandIn) -> tuple[np.ndarray, Any, Any]:
-    """Lets the blade come over the middle of the block: the place [m], and its x and y [pixel]."""
-    guided(page)
-    top = on_top(stand_in, 0.0, 0.0)
-    x, y = page.pixels(top[None])[0]
-    page.mouse('mouseMoved', x, y)
-    stand_in.wait(lambda: stand_in.of(Guide))
-    return top, x, y
-
-
-def end_of_blade(goal: Guide) -> np.ndarray:
-    """Where the blade ends at a goal [m]: it is upright."""
-    return np.array(goal.position) - [0.0, 0.0, 0.004]
-
-
-def test_blade_follows_the_pointer_and_goes_in_while_the_button_is_held(browser: Browser) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        view = page.state()['camera']
-        begin, end = (on_top(stand_in, x, -0.008) for x in (-0.008, 0.008))
-        places = page.pixels(np.linspace(begin, end, 5))
-        for place in places[::-1]:
-            page.mouse('mouseMoved', *place)
-            time.sleep(0.05)
-        stand_in.wait(lambda: np.allclose(stand_in.tip, begin + 0.008 * UP, atol=1e-3))
-        over = end_of_blade(stand_in.of(Guide)[-1])
-        assert over == pytest.approx(begin + 0.004 * UP, abs=5e-4)
-        assert page.says('Height')
-        page.mouse('mousePressed', *places[0], pressed=True)
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < begin[2] - 0.006)
-        for place in places[1:]:
-            page.mouse('mouseMoved', *place, pressed=True)
-            time.sleep(0.05)
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[0] > end[0] - 1e-3)
-        assert page.state()['cutting'] and page.says('Cut depth')
-        page.mouse('mouseReleased', *places[-1])
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] > begin[2] + 0.003)
-        assert page.state()['camera'] == view  # it was no turn of the view
-        time.sleep(0.5)  # until it is at its height again
-        goals = len(stand_in.of(Guide))
-        page.drag(np.array([[290.0, 520.0], [300.0, 520.0], [360.0, 530.0]]))
-        assert page.state()['camera'] != view  # beside the tissue it is one
-        assert len(stand_in.of(Guide)) == goals
-
-
-def test_a_palpator_follows_the_pointer_and_presses_no_deeper_than_it_is_set(
-    browser: Browser,
-) -> None:
-    stand_in = StandIn('lumps')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        place = on_top(stand_in, -0.015, -0.012)
-        (pixel,) = page.pixels(place[None])
-        page.mouse('mouseMoved', *pixel)
-        stand_in.wait(lambda: np.allclose(stand_in.tip, place + 0.008 * UP, atol=1e-3))
-        page.mouse('mousePressed', *pixel, pressed=True)
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < place[2] - 0.0055)
-        time.sleep(1.0)
-        deepest = min(end_of_blade(goal)[2] for goal in stand_in.of(Guide))
-        assert deepest == pytest.approx(place[2] - 0.006, abs=3e-4)
-        assert page.says('Press depth')
-        page.mouse('mouseReleased', *pixel)
-
-
-def test_no_cut_begins_or_goes_on_in_an_old_picture(browser: Browser) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        begin, end = (on_top(stand_in, x, -0.008) for x in (-0.008, 0.008))
-        places = page.pixels(np.array([begin, end]))
-        page.mouse('mouseMoved', *places[0])
-        stand_in.wait(lambda: np.allclose(stand_in.tip, begin + 0.008 * UP, atol=1e-3))
-        stand_in.stands_still.set()
-        page.wait(lambda: page.state()['stale'], 'the age')
-        goals = len(stand_in.of(Guide))
-        page.mouse('mousePressed', *places[0], pressed=True)
-        page.mouse('mouseMoved', *places[1], pressed=True)
-        time.sleep(1.0)
-        assert len(stand_in.of(Guide)) == goals
-        stand_in.stands_still.clear()
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[0] > end[0] - 1e-3)
-        page.mouse('mouseReleased', *places[1])
-
-
-def test_no_goal_jumps_and_the_edge_turns_to_the_stroke(browser: Browser) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        begin, end = on_top(stand_in, 0.0, -0.010), on_top(stand_in, 0.0, 0.010)
-        places = page.pixels(np.linspace(begin, end, 6))
-        page.mouse('mouseMoved', *places[0])
-        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], begin[:2], atol=1e-3))
-        before = len(stand_in.of(Guide))
-        page.mouse('mousePressed', *places[0], pressed=True)
-        page.mouse('mouseMoved', *places[-1], pressed=True)
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[1] > end[1] - 1e-3)
-        time.sleep(0.3)
-        goals = stand_in.of(Guide)[before:]
-        page.mouse('mouseReleased', *places[-1])
-        ways = np.diff([goal.position for goal in goals], axis=0)
-        assert np.linalg.norm(ways, axis=1).max() < 0.016  # 0.12 m/s and 0.04 m/s in 0.1 s at most
-        turns = 2 * np.arctan2(*np.array([[g.wxyz[3], g.wxyz[0]] for g in goals]).T)
-        assert np.abs(np.diff(turns)).max() < 0.41
-        assert turns[-1] == pytest.approx(np.pi / 2, abs=0.15)  # the stroke is along y
-
-
-def test_the_blade_is_pushed_no_deeper_than_moments_say_that_it_is_not_in(
-    browser: Browser,
-) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        top, x, y = hovering(page, stand_in)
-        page.mouse('mousePressed', x, y, pressed=True)
-
-        def depth() -> float:
-            return float(top[2] - end_of_blade(stand_in.of(Guide)[-1])[2])
-
-        stand_in.wait(lambda: depth() > 0.008)  # it is pushed beyond the depth of 6 mm
-        stand_in.stands_still.set()
-        time.sleep(0.1)
-        before = depth()
-        time.sleep(0.6)  # the picture is not called old before a second is over
-        assert depth() < before + 0.002
-        stand_in.stands_still.clear()
-        stand_in.wait(lambda: depth() > 0.021)
-        page.mouse('mouseReleased', x, y)
-
-
-def test_a_lift_on_a_long_way_ends_no_attempt(browser: Browser) -> None:
-    stand_in, end = StandIn('vessel'), load_scene('vessel').exercise.end
-    assert end is not None
-    with opened(browser, stand_in) as page:
-        guided(page)
-        places = [on_top(stand_in, x, 0.0) for x in (-0.022, end.centre[0])]
-        for place in places:
-            before = len(stand_in.of(Guide))
-            page.mouse('mouseMoved', *page.pixels(place[None])[0])
-            stand_in.wait(lambda place=place: np.allclose(stand_in.tip[:2], place[:2], atol=1e-3))
-        highest = max(goal.position[2] for goal in stand_in.of(Guide)[before:])
-        assert places[1][2] + 0.012 < highest < end.centre[2] - end.radius
-
-
-def test_wheel_keys_and_the_button_that_stays_set_depth_and_cut(browser: Browser) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        top, x, y = hovering(page, stand_in)
-        page.evaluate("document.querySelector('#view').focus()")
-        page.call('Input.dispatchMouseEvent', type='mouseWheel', x=x, y=y, deltaX=0, deltaY=120)
-        page.wait(lambda: page.says('Height 3.5 mm'), 'the wheel')
-        key(page, 'PageDown', 'PageDown')
-        page.wait(lambda: page.says('Height 3.0 mm'), 'the key')
-        page.call('Input.dispatchKeyEvent', type='keyDown', code='KeyC', key='c')
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < top[2] - 0.005)
-        page.call('Input.dispatchKeyEvent', type='keyUp', code='KeyC', key='c')
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] > top[2] + 0.002)
-        page._click('[data-guide=cut]', 'true')
-        page.wait(lambda: page.state()['cutting'], 'the cut')
-        before = end_of_blade(stand_in.of(Guide)[-1])
-        page.evaluate("document.querySelector('#view').focus()")
-        for _ in range(6):
-            key(page, 'ArrowRight', 'ArrowRight')
-        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[0] > before[0] + 0.002)
-        key(page, 'Escape', 'Escape')
-        page.wait(lambda: not page.state()['canGuide'], 'the stop')
-        assert stand_in.of(EStop) and not page.state()['cutting']
-
-
-GAMEPAD = """(() => {
-    window.pad = {connected: true, axes: [0, 0, 0, 0],
-        buttons: [...Array(16)].map(() => ({pressed: false}))};
-    navigator.getGamepads = () => [window.pad];
-    window.dispatchEvent(new Event('gamepadconnected'));
-})()"""
-
-
-def test_a_gamepad_moves_cuts_and_stops(browser: Browser) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        page.evaluate(GAMEPAD)
-        page.evaluate('window.pad.axes[0] = 0.9')
-        stand_in.wait(lambda: stand_in.of(Guide))
-        stand_in.wait(lambda: stand_in.of(Guide)[-1].position[0] > 0.01)
-        page.evaluate('window.pad.axes[0] = 0; window.pad.buttons[0].pressed = true')
-        page.wait(lambda: page.state()['cutting'], 'the cut')
-        page.evaluate('window.pad.buttons[1].pressed = true')
-        stand_in.wait(lambda: stand_in.of(EStop))
-        page.wait(lambda: not page.state()['cutting'], 'the stop')
-
-
-def touch(page: Page, kind: str, *points: np.ndarray) -> None:
-    page.call(
-        'Input.dispatchTouchEvent',
-        type=kind,
-        touchPoints=[{'x': p[0], 'y': p[1], 'id': i} for i, p in enumerate(points)],
-    )
-
-
-def test_a_finger_moves_the_blade_above_it_and_a_second_one_cuts(browser: Browser) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        top = on_top(stand_in, 0.0, 0.0)
-        finger = page.pixels(top[None])[0]
-        lower = finger + np.array([0.0, 56.0])
-        touch(page, 'touchStart', finger)
-        stand_in.wait(lambda: stand_in.of(Guide))
-        assert not page.state()['cutting']
-        touch(page, 'touchMove', lower)
-        stand_in.wait(
-            lambda: np.allclose(end_of_blade(stand_in.of(Guide)[-1])[:2], top[:2], atol=2e-3)
-        )
-        touch(page, 'touchStart', lower, finger + np.array([90.0, 80.0]))
-        page.wait(lambda: page.state()['cutting'], 'the cut')
-        touch(page, 'touchEnd')
-        page.wait(lambda: not page.state()['cutting'], 'its end')
-
-
-def test_goals_come_at_thirty_a_second_at_most_and_none_once_the_force_is_off(
-    browser: Browser,
-) -> None:
-    stand_in = StandIn('block')
-    with opened(browser, stand_in) as page:
-        guided(page)
-        x, y = page.pixels(on_top(stand_in, 0.0, 0.0)[None])[0]
-        events = f"""new Promise(done => {{
-            const view = document.querySelector('#view'), began = performance.now();
-            const timer = setInterval(() => {{
-                for (let i = 0; i < 5; i += 1) view.dispatchEvent(new PointerEvent('pointermove', {{
-                    pointerId: 1, clientX: {x} + 5 * Math.random(), clientY: {y}, bubbles: true}}));
-                if (performance.now() - began < 1000) return;
-                clearInterval(timer);
-                done(performance.now() - began);
-            }}, 4);
-        }})"""
-        took = page.call(
-            'Runtime.evaluate', expression=events, awaitPromise=True, returnByValue=True
-        )
-        most = 30 * took['result']['value'] / 1000 + 2
-        assert 3 <= len(stand_in.of(Guide)) <= most
-        key(page, 'Escape', 'Escape')
-        page.wait(lambda: not page.state()['canGuide'], 'the stop')
-        goals = len(stand_in.of(Guide))
-        page.mouse('mouseMoved', x, y)
-        time.sleep(0.3)
-        assert len(stand_in.of(Guide)) == goals
 
 
 def test_what_others_wrote_is_shown_as_text_and_nothing_of_it_runs(browser: Browser) -> None:

@@ -84,7 +84,7 @@ export class Guide {
     this._cuts.clear();
     this._finger = null;
     this.goal = null;
-    this._aim = null; // place on the surface, and its normal
+    this._aim = null; // place on the surface
     this._path = []; // places of a cut that are still to be passed
     this._push = this._level = 0;
     this._entered = false;
@@ -109,7 +109,7 @@ export class Guide {
       this._push = 0;
     }
     this._entered = false;
-    this._heading = this.cutting ? this._aim.point.clone() : null;
+    this._heading = this.cutting ? this._aim.clone() : null;
     this._changed();
     this._soon();
   }
@@ -130,8 +130,8 @@ export class Guide {
       this.raise(by);
       return;
     }
-    const point = (this._path.at(-1) ?? this._aim).point.clone().addScaledVector(this._direction(direction), by);
-    this._aimAt(this._stage.surface.upright(point) ?? { point, normal: Z.clone() });
+    const point = (this._path.at(-1) ?? this._aim).clone().addScaledVector(this._direction(direction), by);
+    this._aimAt(this._stage.surface.upright(point)?.point ?? point);
   }
 
   /** Changes the height, or in a cut the depth [m]. */
@@ -166,10 +166,15 @@ export class Guide {
     const [w, x, y, z] = moment.wxyz;
     this.goal = { position: new Vector3().fromArray(moment.tip), quaternion: new Quaternion(x, y, z, w) };
     const end = this.goal.position.clone().add(this._toEnd());
-    this._aim = surface.upright(end) ?? { point: end.clone().setZ(0), normal: Z.clone() };
-    this._level = clamp(end.z - this._aim.point.z, HEIGHTS);
+    this._aim = surface.upright(end)?.point ?? end.clone().setZ(0);
+    this._level = clamp(end.z - this._aim.z, HEIGHTS);
     this.height = height ?? this._level;
     return true;
+  }
+
+  /** The direction up the handle, along which the blade goes in: a flap that hangs turns its normal. */
+  _handle() {
+    return Z.clone().applyQuaternion(this.goal.quaternion);
   }
 
   /** From the tool's position to the end of its blade. */
@@ -224,17 +229,16 @@ export class Guide {
     const box = this._stage.canvas.getBoundingClientRect();
     const x = (2 * (event.clientX - box.x)) / box.width - 1, y = 1 - (2 * (event.clientY - above - box.y)) / box.height;
     this._ray.setFromCamera(new Vector2(x, y), this._stage.camera);
-    return this._stage.surface.hit(this._ray.ray);
+    return this._stage.surface.hit(this._ray.ray)?.point ?? null;
   }
 
   /** Beside the tissue a cut goes on at the same height, so that it can leave through an edge. */
   _beside(event) {
     this._hit(event); // aims the ray
-    const last = (this._path.at(-1) ?? this._aim).point;
+    const last = this._path.at(-1) ?? this._aim;
     const plane = new Plane().setFromNormalAndCoplanarPoint(Z, last);
     const point = this._ray.ray.intersectPlane(plane, new Vector3());
-    if (point === null || point.distanceTo(last) > 5 * FAR) return null;
-    return { point, normal: Z.clone() };
+    return point === null || point.distanceTo(last) > 5 * FAR ? null : point;
   }
 
   // Keys
@@ -289,10 +293,10 @@ export class Guide {
       return;
     }
     const end = new Vector3().fromArray(moment.tip).add(this._toEnd());
-    const way = Math.hypot(end.x - this._aim.point.x, end.y - this._aim.point.y);
+    const way = Math.hypot(end.x - this._aim.x, end.y - this._aim.y);
     const sinks = this._down(dt, way, moment);
     const moves = this._along(dt) || sinks || way > FAR;
-    const goal = this.goal.position.copy(this._aim.point).addScaledVector(this._aim.normal, this._level).sub(this._toEnd());
+    const goal = this.goal.position.copy(this._aim).addScaledVector(this._handle(), this._level).sub(this._toEnd());
     if (!this.cutting) goal.z += clamp(Math.min(way - FAR, this.ceiling - goal.z), [0, MAX_LIFT]);
     this._bound(this.goal.position);
     this._say();
@@ -323,12 +327,9 @@ export class Guide {
     const goes = this._entered || this._push === MAX_PUSH || !this._stage.tool.cuts;
     let left = goes ? STROKE * dt * this._head(dt) : 0;
     while (this._path.length > 0 && left > 0) {
-      const next = this._path[0], far = next.point.distanceTo(this._aim.point);
+      const next = this._path[0], far = next.distanceTo(this._aim);
       const share = Math.min(1, left / Math.max(far, 1e-12));
-      this._aim = {
-        point: this._aim.point.clone().lerp(next.point, share),
-        normal: this._aim.normal.clone().lerp(next.normal, share).normalize(),
-      };
+      this._aim = this._aim.clone().lerp(next, share);
       if (share === 1) this._path.shift();
       left -= far;
     }
@@ -338,11 +339,11 @@ export class Guide {
   /** Turns the edge to the stroke, as a hand does; returns the share of the speed until it faces it. */
   _head(dt) {
     const { facing } = this._stage.tool;
-    const ahead = this._path.find(({ point }) => point.distanceTo(this._aim.point) > HEADING) ?? this._aim;
-    const way = ahead.point.clone().sub(this._heading).setZ(0);
+    const ahead = this._path.find((point) => point.distanceTo(this._aim) > HEADING) ?? this._aim;
+    const way = ahead.clone().sub(this._heading).setZ(0);
     const length = way.length();
     if (facing.lengthSq() === 0 || length < HEADING) return 1;
-    this._heading.addScaledVector(this._aim.point.clone().sub(this._heading), 1 - HEADING / length);
+    this._heading.addScaledVector(this._aim.clone().sub(this._heading), 1 - HEADING / length);
     const edge = facing.clone().applyQuaternion(this.goal.quaternion);
     const angle = Math.atan2(edge.x * way.y - edge.y * way.x, edge.x * way.x + edge.y * way.y);
     const turn = new Quaternion().setFromAxisAngle(Z, clamp(angle, [-TURN * dt, TURN * dt]));
