@@ -267,14 +267,21 @@ def run(make_node: Callable[[], ManagedNode]) -> Any:
     stop = Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    node, problem = None, ''
     try:
         node = make_node()
         if node.autostart:
             _start(node)
     except ValueError as error:
-        print(f'error: {error}', file=sys.stderr, flush=True)
+        problem = str(error)
+    if problem or node is None:
+        if node is not None:
+            node.destroy_node()
+        node = None
+        gc.collect()  # a node whose making failed
+        print(f'error: {problem}', file=sys.stderr, flush=True)
         rclpy.shutdown()
-        raise SystemExit(2) from None
+        raise SystemExit(2)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     spinner = threading.Thread(target=_spin, args=(executor, node, stop), daemon=True)
@@ -287,9 +294,11 @@ def run(make_node: Callable[[], ManagedNode]) -> Any:
     finally:
         stop.set()
         spinner.join(2.0)
-        node.end()
-        node.destroy_node()
-        rclpy.shutdown()
+        try:
+            node.end()
+        finally:
+            node.destroy_node()
+            rclpy.shutdown()
     return node
 
 

@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ MAX_TIMELY_LATENESS_S = 0.0005
 """Latest wake-up after the deadline that still counts as timely."""
 FRAME_NICENESS = -10
 """Niceness of the processes on the critical path of a tissue frame."""
+_GROUP = Path('/proc/self/autogroup')
 
 
 class PeriodicLoop:
@@ -182,10 +184,6 @@ def request_preference(niceness: int) -> str:
     This is for work with a deadline that may occupy a processor for longer than a real-time thread
     should. Receiving threads are included: a frame waits for the answers that they receive.
 
-    Where the kernel shares processors between terminals and desktops first, a niceness counts only
-    among processes of the same one (sched(7), "The autogroup feature"). The group of this process
-    is therefore preferred to the others, a browser's for example; its processes share that.
-
     Args:
         niceness: below 0.
 
@@ -201,6 +199,41 @@ def request_preference(niceness: int) -> str:
             'no preference over other processes is allowed for this user: allow it with "nice -20" '
             'in /etc/security/limits.d and log in again'
         )
-    with contextlib.suppress(OSError):  # not by this kernel, or set a moment ago
-        Path('/proc/self/autogroup').write_text(str(FRAME_NICENESS))
     return f'preferred to other processes: niceness {niceness}'
+
+
+@contextlib.contextmanager
+def preferred_group() -> Iterator[None]:
+    """Prefer the programs of this terminal to those of others, where that is allowed.
+
+    Where the kernel shares processors between terminals and desktops first, a niceness counts only
+    among processes of the same one (sched(7), "The autogroup feature"). A browser would then get as
+    much as all nodes together.
+    """
+    before = _group_niceness()
+    if before is not None:
+        _set_group_niceness(FRAME_NICENESS)
+    try:
+        yield
+    finally:
+        if before is not None:
+            _set_group_niceness(before)
+
+
+def _group_niceness() -> int | None:
+    try:
+        return int(_GROUP.read_text().split()[-1])
+    except (OSError, ValueError, IndexError):  # not by this kernel
+        return None
+
+
+def _set_group_niceness(niceness: int) -> None:
+    for _ in range(2):
+        try:
+            _GROUP.write_text(str(niceness))
+        except BlockingIOError:  # another one was set less than 0.1 s ago
+            time.sleep(0.12)
+        except OSError:  # it is not allowed
+            return
+        else:
+            return

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from cutting_trainer.node_common.timing import preferred_group
 from cutting_trainer.session.e_stop_memory import PRESS, PRESSED, EStopState
 from cutting_trainer.session.node_process import (
     NodeCommand,
@@ -85,6 +86,7 @@ class Supervisor:
         self.e_stop = EStopState(commands, keys=keys)
         self._commands = commands
         self._logs = log_folder
+        self._group = preferred_group()
         self._environment = environment
         self._emit = on_event
         self._nodes: dict[str, NodeProcess] = {}
@@ -100,12 +102,14 @@ class Supervisor:
         for number in STOPPING_SIGNALS:
             self._handlers[number] = signal.signal(number, self._on_signal)
         self.e_stop.keys.__enter__()
+        self._group.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
         try:
             self.end()
         finally:
+            self._group.__exit__(None, None, None)
             self.e_stop.keys.__exit__(None, None, None)
             for number, handler in self._handlers.items():
                 signal.signal(number, handler)  # type: ignore[arg-type]

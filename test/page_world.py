@@ -104,6 +104,7 @@ class StandIn:
         self._open_a_cut()
         self.tip = np.array([*positions.mean(axis=0)[:2], positions[:, 2].max() + 0.02])
         self.goal = self.tip.copy()
+        self.wxyz = [1.0, 0.0, 0.0, 0.0]
         self.state, self.e_stopped, self.recording = 'DISABLED', False, ''
         self.held, self.tissue = False, dict(OWN_TISSUE)
         self.clutched = False
@@ -213,7 +214,7 @@ class StandIn:
         elif isinstance(message, SetTissue):
             self.tissue = {'stiffness': message.stiffness, 'toughness': message.toughness}
         elif isinstance(message, Guide):
-            self.goal = np.array(message.position)
+            self.goal, self.wxyz = np.array(message.position), list(message.wxyz)
         elif isinstance(message, Record):
             self.recording = '2026-01-01_12-00-00_liver' if message.on else ''
         elif isinstance(message, Scale):
@@ -250,7 +251,7 @@ class StandIn:
         self.server.put(
             'moment',
             tip=self.tip.tolist(),
-            wxyz=[1.0, 0.0, 0.0, 0.0],
+            wxyz=self.wxyz,
             proxy=[*self.tip[:2].tolist(), max(float(self.tip[2]), top)],
             force=force,
             depth=depth,

@@ -337,6 +337,21 @@ def test_target_and_zone_are_drawn_on_the_tissue_and_move_with_it(
             )
 
 
+def test_a_lesion_is_drawn_on_the_tissue(browser: Browser) -> None:
+    stand_in = StandIn('excision')
+    with opened(browser, stand_in) as page:
+        page.evaluate("document.querySelector('[data-view=top]').click()")
+        stand_in.tip[1] = stand_in.goal[1] = 0.06  # the tool is not over it
+        line = np.linspace([-0.0024, 0.003, 0.004], [0.0024, 0.003, 0.004], 15)
+        beside = line - [0.0, 0.010, 0.0]  # between lesion and border
+
+        def darker() -> bool:
+            inked, bare = (colours(page, at).mean() for at in (line, beside))
+            return bool(bare - inked > 15)
+
+        page.wait(darker, 'the lesion')
+
+
 def drawn(page: Page, points: np.ndarray, beside: float) -> bool:
     """Whether the ink is at these places and not beside them: it is less red than the tissue."""
     inked, bare = (colours(page, at) for at in (points, points - np.array([0.0, beside, 0.0])))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from page_world import StandIn, guided, key, opened
+from scipy.spatial.transform import Rotation
 
 from bench.page.browser import CHROMIUM, Browser, Page, chromium
 from cutting_trainer.session.scene_loader import load_scene
@@ -42,8 +43,9 @@ def hovering(page: Page, stand_in: StandIn) -> tuple[np.ndarray, Any, Any]:
 
 
 def end_of_blade(goal: Guide) -> np.ndarray:
-    """Where the blade ends at a goal [m]: it is upright."""
-    return np.array(goal.position) - [0.0, 0.0, 0.004]
+    """Where the blade ends at a goal [m]."""
+    w, *turn = goal.wxyz
+    return np.array(goal.position) - 0.004 * Rotation.from_quat([*turn, w]).apply(UP)
 
 
 def test_blade_follows_the_pointer_and_goes_in_while_the_button_is_held(browser: Browser) -> None:
@@ -92,6 +94,51 @@ def test_the_blade_goes_in_along_its_handle_however_the_surface_lies(browser: Br
         below = ends[ends[:, 2] < place[2]]
         assert len(below) > 3
         assert np.abs(below[:, :2] - place[:2]).max() < 5e-4
+
+
+def test_a_tilted_tool_goes_in_along_its_handle_and_its_first_goal_is_no_jump(
+    browser: Browser,
+) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        top, x, y = hovering(page, stand_in)
+        page.evaluate("document.querySelector('#view').focus()")
+        for name, times in (('r', 10), ('PageUp', 16)):  # 30 degrees, 12 mm
+            for _ in range(times):
+                key(page, name, name)
+        page.wait(lambda: page.says('Height 12.0 mm'), 'the height')
+        stand_in.wait(lambda: np.linalg.norm(stand_in.tip - stand_in.goal) < 1e-4)
+        for control, guides in (('pause', False), ('start', True)):
+            page.press(control)
+            page.wait(lambda wanted=guides: page.state()['canGuide'] is wanted, 'the hand')
+        known = len(stand_in.of(Guide))
+        page.evaluate("document.querySelector('#view').focus()")
+        key(page, 'ArrowRight', 'ArrowRight')
+        stand_in.wait(lambda: len(stand_in.of(Guide)) > known)
+        assert np.linalg.norm(stand_in.of(Guide)[known].position - stand_in.tip) < 0.002
+        page.mouse('mouseMoved', x, y)
+        page.mouse('mousePressed', x, y, pressed=True)
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < top[2] - 0.004)
+        page.mouse('mouseReleased', x, y)
+
+
+def test_a_blade_that_is_let_go_comes_out_where_it_is(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        begin, end = stand_in.on_top(-0.010, 0.0), stand_in.on_top(0.012, 0.0)
+        places = page.pixels(np.array([begin, end]))
+        page.mouse('mouseMoved', *places[0])
+        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], begin[:2], atol=1e-3))
+        page.mouse('mousePressed', *places[0], pressed=True)
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < begin[2] - 0.006)
+        page.mouse('mouseMoved', *places[1], pressed=True)
+        page.mouse('mouseReleased', *places[1])  # with the way still before it
+        known = len(stand_in.of(Guide))
+        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], end[:2], atol=1e-3))
+        ends = np.array([end_of_blade(goal) for goal in stand_in.of(Guide)[known - 1 :]])
+        ways = np.linalg.norm(np.diff(ends, axis=0)[:, :2], axis=1)
+        assert ways[ends[:-1, 2] < begin[2]].max(initial=0.0) < 0.013  # 0.12 m/s for 0.1 s at most
 
 
 def test_a_palpator_follows_the_pointer_and_presses_no_deeper_than_it_is_set(

@@ -13,11 +13,13 @@ from pathlib import Path
 
 import pytest
 
+from cutting_trainer.node_common.timing import FRAME_NICENESS
 from cutting_trainer.session.node_process import CUT_OFF, NodeCommand
 from cutting_trainer.session.supervisor import Event, Supervisor
 
 pytestmark = pytest.mark.long
 
+GROUP = Path('/proc/self/autogroup')
 FAKE = Path(__file__).with_name('fake_node.py')
 ROOT = FAKE.parents[1]
 ENVIRONMENT = os.environ | {'PYTHONUNBUFFERED': '1'}
@@ -437,3 +439,25 @@ def test_messages_that_cannot_be_read_are_counted_and_end_nothing(
     # What followed in the line that was too long is not taken for lines of its own.
     written = (tmp_path / 'bag' / 'log' / 'viewer.log').read_text().splitlines()
     assert [line.endswith(CUT_OFF) for line in written if 'xxx' in line] == [True]
+
+
+@pytest.mark.skipif(not GROUP.exists(), reason='the kernel shares processors without groups')
+def test_a_session_is_preferred_to_other_programs_until_its_end(tmp_path: Path) -> None:
+    """As a group: else the niceness of nodes means nothing to a browser that draws by software."""
+    code = f"""
+import os
+from pathlib import Path
+from cutting_trainer.session.supervisor import Supervisor
+def niceness():
+    return int(Path({str(GROUP)!r}).read_text().split()[-1])
+before = niceness()
+with Supervisor([], Path({str(tmp_path)!r}), os.environ):
+    within = niceness()
+print(before, within, niceness())
+os.nice(-1)"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, start_new_session=True
+    )
+    allowed = 'PermissionError' not in done.stderr
+    said = [int(word) for word in done.stdout.split()]
+    assert said == [0, FRAME_NICENESS if allowed else 0, 0], done

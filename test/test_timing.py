@@ -1,22 +1,13 @@
 """Statistics of a loop for wake-ups worked out by hand, and which threads ask for preference."""
 
-import subprocess
-import sys
 import threading
-from pathlib import Path
 
 import pytest
 
 from cutting_trainer.node_common import timing
-from cutting_trainer.node_common.timing import (
-    FRAME_NICENESS,
-    Durations,
-    PeriodicLoop,
-    request_preference,
-)
+from cutting_trainer.node_common.timing import Durations, PeriodicLoop, request_preference
 
 MS = 1_000_000
-GROUP = Path('/proc/self/autogroup')
 
 
 class Clock:
@@ -114,16 +105,3 @@ def test_preference_is_asked_for_every_thread(monkeypatch: pytest.MonkeyPatch) -
     finally:
         over.set()
         other.join()
-
-
-@pytest.mark.skipif(not GROUP.exists(), reason='the kernel shares processors without groups')
-def test_whole_group_is_preferred_to_those_of_other_programs() -> None:
-    """Else the niceness means nothing to a browser that draws by software."""
-    code = f"""
-from pathlib import Path
-from cutting_trainer.node_common.timing import request_preference
-print('preferred' in request_preference(-7), Path({str(GROUP)!r}).read_text())"""
-    said = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, start_new_session=True
-    ).stdout.split()
-    assert int(said[-1]) == (FRAME_NICENESS if said[0] == 'True' else 0)

@@ -12,6 +12,7 @@ from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
+from meshes import box
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -24,6 +25,9 @@ from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.session import demo_command
+from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.streaming.messages import mesh_message
 from cutting_trainer.viewer.access_control import PageError, PageLimits
 from cutting_trainer.viewer.allowed_requests import LiveControls
 from cutting_trainer.viewer.drawn_surface import TissueSource, cut_edges
@@ -109,6 +113,19 @@ def test_a_page_that_does_not_read_slows_only_itself_and_then_gets_the_newest(
     assert stuck.updates < FRAMES  # what lay between was dropped, not kept for it
     fast.close()
     stuck.close()
+
+
+def test_another_tissue_is_shown_though_its_revision_is_that_of_the_one_before() -> None:
+    """Both untouched, as where an exercise begins at once."""
+    replica, source, shapes = MeshReplica(), TissueSource('tissue'), []
+    for cells in ((2, 2, 2), (3, 2, 2)):
+        mesh = TetMesh(*box(cells, 0.01), np.zeros(0, np.int64))
+        replica.load(mesh_message(mesh, np.zeros_like(mesh.rest), '', 0, 0, 1))
+        frame = source.frame(replica)
+        assert frame is not None
+        shapes.append(len(frame.faces[0]))
+        assert source.frame(replica) is None
+    assert shapes[1] > shapes[0]
 
 
 def test_faces_are_sent_only_when_the_connectivity_changes(

@@ -143,14 +143,17 @@ class TissueSource:
         self._name = name
         self._drawn = DrawnTissue()
         self._shown: tuple[object, int] = (None, -1)
+        self._array: object = None
         self._frames = self._faces = 0
 
     def frame(self, replica: DrawableTissue) -> TissueFrame | None:
         """Return the tissue as it is now; None where it has not changed since the last call."""
-        now = (replica, replica.revision)
-        if now == self._shown or replica.revision < 0:
+        now, rest = (replica, replica.revision), replica.rest
+        array = rest if rest.base is None else rest.base
+        # Another tissue may have the same revision; its arrays are others.
+        if (now == self._shown and array is self._array) or replica.revision < 0:
             return None
-        self._shown = now
+        self._shown, self._array = now, array
         self._frames += 1
         self._faces += self._drawn.follow(replica)
         parts = self._drawn.parts

@@ -11,6 +11,7 @@ const DENSITY = 12000, MAX_PIXELS = 1024; // [1/m] pixels of the ink
 const EDGE = 0.0004; // [m] line around an area
 const DASH = 0.0032, GAP = 0.0018; // [m] of a target's line
 const PATTERN = 0.0022; // [m] period of hatching and dots
+const POINT = 1e-6; // [m] of the line that is drawn at a single place
 const RING = 0.00025; // [m] radius of a ring's wire
 const BRIDGE = 0.0028; // [m] radius of the ring around what holds a lesion
 
@@ -116,7 +117,7 @@ class Paper {
     context.beginPath();
     points.forEach(([x, y], index) => (index === 0 ? context.moveTo(x, y) : context.lineTo(x, y)));
     if (closed) context.closePath();
-    else if (points.length === 1) context.lineTo(...points[0]);
+    else if (points.length === 1) context.lineTo(points[0][0] + POINT, points[0][1]);
     context.stroke();
   }
 }

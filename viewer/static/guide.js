@@ -85,6 +85,7 @@ export class Guide {
     this._finger = null;
     this.goal = null;
     this._aim = null; // place on the surface
+    this._waiting = null; // that of a pointer, until the blade is out of the tissue
     this._path = []; // places of a cut that are still to be passed
     this._push = this._level = 0;
     this._entered = false;
@@ -104,7 +105,7 @@ export class Guide {
     else this._cuts.delete(by);
     if (this.cutting === before) return;
     if (!this.cutting) {
-      if (this._path.length > 0) this._aim = this._path.at(-1);
+      this._waiting = this._path.at(-1) ?? null;
       this._path = [];
       this._push = 0;
     }
@@ -130,7 +131,7 @@ export class Guide {
       this.raise(by);
       return;
     }
-    const point = (this._path.at(-1) ?? this._aim).clone().addScaledVector(this._direction(direction), by);
+    const point = (this._path.at(-1) ?? this._waiting ?? this._aim).clone().addScaledVector(this._direction(direction), by);
     this._aimAt(this._stage.surface.upright(point)?.point ?? point);
   }
 
@@ -166,8 +167,10 @@ export class Guide {
     const [w, x, y, z] = moment.wxyz;
     this.goal = { position: new Vector3().fromArray(moment.tip), quaternion: new Quaternion(x, y, z, w) };
     const end = this.goal.position.clone().add(this._toEnd());
-    this._aim = surface.upright(end)?.point ?? end.clone().setZ(0);
-    this._level = clamp(end.z - this._aim.z, HEIGHTS);
+    const up = this._handle();
+    const ray = { origin: end.clone().add(up), direction: up.clone().negate() };
+    this._aim = surface.hit(ray)?.point ?? end.clone().addScaledVector(up, -end.z);
+    this._level = clamp(end.clone().sub(this._aim).dot(up), HEIGHTS);
     this.height = height ?? this._level;
     return true;
   }
@@ -269,7 +272,7 @@ export class Guide {
 
   _aimAt(hit) {
     if (this.cutting) this._path.push(hit);
-    else this._aim = hit;
+    else this._waiting = hit;
     this._soon();
   }
 
@@ -293,9 +296,15 @@ export class Guide {
       return;
     }
     const end = new Vector3().fromArray(moment.tip).add(this._toEnd());
-    const way = Math.hypot(end.x - this._aim.x, end.y - this._aim.y);
+    // A blade that is still in the tissue comes out where it is.
+    if (!this.cutting && this._waiting !== null && this._level >= Math.min(0, this.height)) {
+      this._aim = this._waiting;
+      this._waiting = null;
+    }
+    const place = this._aim.clone().addScaledVector(this._handle(), this._level);
+    const way = Math.hypot(end.x - place.x, end.y - place.y);
     const sinks = this._down(dt, way, moment);
-    const moves = this._along(dt) || sinks || way > FAR;
+    const moves = this._along(dt) || sinks || way > FAR || this._waiting !== null;
     const goal = this.goal.position.copy(this._aim).addScaledVector(this._handle(), this._level).sub(this._toEnd());
     if (!this.cutting) goal.z += clamp(Math.min(way - FAR, this.ceiling - goal.z), [0, MAX_LIFT]);
     this._bound(this.goal.position);
