@@ -342,14 +342,14 @@ def test_a_lesion_is_drawn_on_the_tissue(browser: Browser) -> None:
     with opened(browser, stand_in) as page:
         page.evaluate("document.querySelector('[data-view=top]').click()")
         stand_in.tip[1] = stand_in.goal[1] = 0.06  # the tool is not over it
-        line = np.linspace([-0.0024, 0.003, 0.004], [0.0024, 0.003, 0.004], 15)
-        beside = line - [0.0, 0.010, 0.0]  # between lesion and border
+        line = np.linspace([-0.002, -0.0052, 0.004], [0.002, -0.0052, 0.004], 15)
+        beside = line - [0.0, 0.0016, 0.0]  # between lesion and border
 
         def darker() -> bool:
-            inked, bare = (colours(page, at).mean() for at in (line, beside))
-            return bool(bare - inked > 15)
+            inked, bare = (colours(page, at)[:, 0].mean() for at in (line, beside))
+            return bool(bare - inked > 45)
 
-        page.wait(darker, 'the lesion')
+        page.wait(darker, 'the lesion', 20.0)
 
 
 def drawn(page: Page, points: np.ndarray, beside: float) -> bool:
