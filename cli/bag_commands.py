@@ -259,9 +259,11 @@ def attempts(
             Console(stderr=True).print(f'left out: {escape(problem)}', highlight=False)
     if delete:
         gone = of.delete(store, bags, delete)
-        _tell({'deleted': gone} if as_json else f'deleted, with {len(gone)} bags', as_json=as_json)
+        many = f'{len(gone)} bag{"s" * (len(gone) != 1)}'
+        said = f'deleted the attempts of {delete}, with {many}'
+        _tell({'deleted': gone} if as_json else said, as_json=as_json)
         return
-    rows = store.rows(subject, exercise)
+    rows = of.chosen(store, subject, exercise)
     if output is not None:
         of.export_rows(rows, output)
         _tell_written([output], as_json=as_json)

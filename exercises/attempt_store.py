@@ -166,8 +166,8 @@ class LearningCurve:
         attempts: numbers of the scored attempts.
         points: their scores.
         average: mean of the last `WINDOW` scores up to each.
-        first_pass: number of the first attempt from which the average stays at the pass line or
-            above; None: it is below it at the end.
+        first_pass: number of the first attempt that passed and from which the average stays at the
+            pass line or above; None: there is none.
     """
 
     subject: str
@@ -197,7 +197,8 @@ def learning_curves(rows: Sequence[AttemptRow], pass_score: float) -> list[Learn
             for i in range(len(points))
         ]
         below = [i for i, value in enumerate(average) if value < pass_score]
-        first = below[-1] + 1 if below else 0
+        start = below[-1] + 1 if below else 0
+        passed = (row.attempt for row in own[start:] if row.passed)
         curves.append(
             LearningCurve(
                 subject,
@@ -205,7 +206,7 @@ def learning_curves(rows: Sequence[AttemptRow], pass_score: float) -> list[Learn
                 tuple(row.attempt for row in own),
                 tuple(points),
                 tuple(average),
-                own[first].attempt if first < len(own) else None,
+                next(passed, None),
             )
         )
     return curves

@@ -4,6 +4,7 @@ All geometry is that of the tissue at rest, so that neither the motion of the ti
 opening of a wound changes a measure. Depth is along -z, from the height of the target.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -24,7 +25,6 @@ Floats = NDArray[np.float64]
 SPACING_M = 0.0005
 """[m] between samples of a curve, and at most between those of a cut face."""
 _MAX_ORDER = 40
-_NOWHERE = 1e9
 
 
 class Tissue(pieces.Tissue, Protocol):
@@ -204,19 +204,19 @@ def lesion_margin(tissue: Tissue, lesion: BallSettings) -> float:
     """Return the least thickness of tissue around a lesion in the piece that came off [m].
 
     It is the least distance from the lesion's surface to a cut face of the piece that contains its
-    centre: negative where the cut goes into it, -1e9 while the lesion is not off.
+    centre: negative where the cut goes into it, NaN while the lesion is not off.
     """
     part = free_parts(tissue)
     rest = np.asarray(tissue.rest, float)
     own = int(part[_node_in(tissue, lesion)])
     if not own:
-        return -_NOWHERE
+        return math.nan
     triangles = np.asarray(tissue.triangles)
     faces = (np.asarray(tissue.triangle_kind) == 1) & (part[triangles[:, 0]] == own)
     cut = _Faces(rest, triangles[faces], np.ones(faces.sum(), int))
     points = cut_faces(cut).points
     if not len(points):
-        return -_NOWHERE
+        return math.nan
     off = np.linalg.norm(points - np.array(lesion.centre), axis=1)
     return float(off.min()) - lesion.radius
 

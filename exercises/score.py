@@ -34,7 +34,7 @@ UNITS: dict[MeasureName, tuple[float, str, str]] = {
 }
 """Factor from SI, unit and name of each measure, for people."""
 _WITHOUT: dict[MeasureName, str] = {'lesion_margin': 'the lesion is still held'}
-"""Words for a measure without a value, where there is more to say than 'none'."""
+"""Words for a measure without a value, where there is more to say."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ class Score:
 def in_words(measure: MeasureName, value: float) -> str:
     """Return a value with its unit, for people."""
     factor, unit, _ = UNITS[measure]
-    if math.isnan(value) or abs(value) >= 1e8:
-        return _WITHOUT.get(measure, 'none')
+    if math.isnan(value):
+        return _WITHOUT.get(measure, 'nothing to measure')
     return f'{value * factor:.3g} {unit}'.strip()
 
 

@@ -106,13 +106,16 @@ def list_table(rows: Sequence[AttemptRow]) -> Table:
     table.add_column('bag', overflow='fold')  # the name is what `--compare` takes
     for row in rows:
         begun = datetime.fromtimestamp(row.begun, UTC)
-        result = ('passed' if row.passed else 'failed') if row.state == 'scored' else row.state
         name = Path(row.bag).name
         table.add_row(
             f'{begun:%Y-%m-%d %H:%M:%S}', escape(row.subject), escape(row.exercise),
-            str(row.attempt), _points(row), result, escape(name),
+            str(row.attempt), _points(row), _result(row), escape(name),
         )  # fmt: skip
     return table
+
+
+def _result(row: AttemptRow) -> str:
+    return ('passed' if row.passed else 'failed') if row.state == 'scored' else row.state
 
 
 def _points(row: AttemptRow) -> str:
@@ -124,11 +127,29 @@ def comparison_table(one: AttemptRow, two: AttemptRow) -> Table:
     table = Table('measure', escape(Path(one.bag).name), escape(Path(two.bag).name))
     table.add_row('exercise', escape(one.exercise), escape(two.exercise))
     table.add_row('points', _points(one), _points(two))
+    table.add_row('result', _result(one), _result(two))
     for name in MEASURES:
         values = [row.measures.get(name, math.nan) for row in (one, two)]
         if not all(map(math.isnan, values)):
             table.add_row(UNITS[name][2], *(in_words(name, value) for value in values))
     return table
+
+
+def chosen(store: AttemptStore, subject: str, exercise: str) -> list[AttemptRow]:
+    """Return the attempts of a subject and at an exercise; '' is any.
+
+    Raises:
+        SessionError: there are attempts, but none of these.
+    """
+    rows = store.rows(subject, exercise)
+    if not rows and (known := store.rows('', '')):
+        asked = ' and '.join(filter(None, (subject, exercise)))
+        names = ', '.join(sorted({row.exercise for row in known}))
+        raise SessionError(
+            f'the index has no attempt of {asked!r}: it has the exercises {names}; `attempts` '
+            'lists the subjects'
+        )
+    return rows
 
 
 def find(rows: Sequence[AttemptRow], bag: str) -> AttemptRow:
@@ -137,7 +158,8 @@ def find(rows: Sequence[AttemptRow], bag: str) -> AttemptRow:
     Raises:
         SessionError: there is none.
     """
-    named = [row for row in rows if bag in (row.bag, Path(row.bag).name)]
+    path = str(Path(bag).resolve())
+    named = [row for row in rows if row.bag == path or Path(row.bag).name == bag]
     if not named:
         raise SessionError(f'{bag} is no attempt in the index: `attempts` lists them')
     return named[0]

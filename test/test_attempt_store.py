@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from cutting_trainer.exercises.attempt_store import (
 )
 from cutting_trainer.node_common.share_folder import PACKAGES
 from cutting_trainer.recordings.attempts_command import (
+    chosen,
     comparison_table,
     delete,
     export_rows,
@@ -105,6 +107,9 @@ def test_a_curve_is_the_mean_of_the_last_five_and_knows_when_it_stays_above() ->
     assert curve.average[-1] == pytest.approx((60 + 80 + 90 + 90 + 90) / 5)
     assert curve.first_pass == 6
     assert learning_curves(rows[:2], 70.0)[0].first_pass is None
+    failed = replace(row('/x/10', points=90, number=1), passed=False)  # a required one is missed
+    assert learning_curves([failed], 70.0)[0].first_pass is None
+    assert learning_curves([failed, rows[7]], 70.0)[0].first_pass == 8
 
 
 def test_exports_have_a_row_for_each_attempt(tmp_path) -> None:
@@ -236,3 +241,18 @@ def test_the_command_lists_compares_exports_and_deletes(tmp_path, capsys) -> Non
     assert len((tmp_path / 'attempts.csv').read_text(encoding='utf-8').splitlines()) == 3
     assert json.loads(attempts('--delete', 'SUBJECT', '--json'))['deleted'] == [str(one), str(two)]
     assert not one.exists() and not two.exists() and json.loads(attempts('--json')) == []
+
+
+def test_an_attempt_is_found_by_name_and_by_any_path_and_a_wrong_exercise_is_named(
+    tmp_path, monkeypatch
+) -> None:
+    store = open_store(tmp_path)
+    one = row(tmp_path / 'sessions' / 'one')
+    store.put([one])
+    monkeypatch.chdir(tmp_path)
+    for given in ('one', 'sessions/one', './sessions/one/', str(tmp_path / 'sessions' / 'one')):
+        assert find([one], given) == one
+    assert chosen(store, 'a', 'circle') == [one]
+    with pytest.raises(SessionError, match="no attempt of 'circel': it has the exercises circle"):
+        chosen(store, '', 'circel')
+    assert chosen(open_store(tmp_path / 'empty'), '', 'circel') == []

@@ -154,7 +154,7 @@ def test_margin_of_a_lesion_is_that_to_the_cut_and_none_while_it_is_held() -> No
     # The face at z = -1 is cut, and sampled at 40 parts of its longest edge.
     assert lesion_margin(tissue, lesion) == pytest.approx(0.9, abs=0.01)
     tissue.fixed[0] = 1
-    assert lesion_margin(tissue, lesion) < -1e6
+    assert math.isnan(lesion_margin(tissue, lesion))
 
 
 @pytest.mark.parametrize('degrees', [-150, 24, 90])

@@ -141,7 +141,7 @@ def test_a_bridge_that_rests_leaves_no_force_and_comes_back_without_one(managers
 
 
 ENDS = """
-import os, signal, threading
+import os, signal, sys
 from cutting_trainer.node_common.lifecycle import ManagedNode, run
 
 def sockets():
@@ -151,21 +151,30 @@ def sockets():
     return sum(os.readlink(at) in udp for at in links if os.path.islink(at))
 
 class Lives(ManagedNode):
+    def configure(self):
+        print(f'{sockets()} sockets at the start')
+        if 'fails' in sys.argv:
+            raise ValueError('it is to fail')
+
     def work(self, stop):
         print(f'{sockets()} sockets at work')
         os.kill(os.getpid(), signal.SIGINT)
         stop.wait()
 
-run(lambda: Lives('lives'))
-print(f'{sockets()} sockets at the end')
+try:
+    run(lambda: Lives('lives'))
+finally:
+    print(f'{sockets()} sockets at the end')
 """
 
 
-def test_no_thread_of_the_middleware_outlives_a_node() -> None:
+@pytest.mark.parametrize('end', ['interrupted', 'fails'])
+def test_no_thread_of_the_middleware_outlives_a_node(end: str) -> None:
     """One that does reads what the end of the process destroys: a node died of SIGSEGV so."""
-    command = [sys.executable, '-c', ENDS]
+    command = [sys.executable, '-c', ENDS, end]
     done = subprocess.run(
         command, cwd=ROOT, env=node_environment(free_domain()), capture_output=True, text=True
     )
-    work, end = (int(line.split()[0]) for line in done.stdout.splitlines() if 'sockets' in line)
-    assert work > 0 and end == 0, done
+    counts = [int(line.split()[0]) for line in done.stdout.splitlines() if 'sockets' in line]
+    assert done.returncode == (2 if end == 'fails' else 0), done
+    assert counts[0] > 0 and counts[-1] == 0, done
