@@ -359,7 +359,9 @@ class Supervisor:
         """Register the end of a process, which is a death or was requested."""
         status = node.process.returncode
         if node.asked_to_end and status not in EXPECTED_STATUSES:
-            where = f': {" / ".join(node.tail)}' if node.crashed else ', see its log'
+            # An interpreter that is interrupted while it starts reports a fatal error, too.
+            crashed = node.crashed and status < 0
+            where = f': {" / ".join(node.tail)}' if crashed else ', see its log'
             text = f'{node.name} did not end well ({describe(status)}){where}'
             self._emit(Event('warning', node.name, text))
         if node.asked_to_end or (node.done and status == 0):

@@ -62,6 +62,10 @@ def main(name: str, ledger: str, *habits: str) -> None:
             print(f'beat: {name}')
     if 'slow' in habits:
         time.sleep(0.3)
+    if 'unborn' in habits:  # what Python says that is interrupted before it has started
+        print('Fatal Python error: init_import_site: Failed to import the site module')
+        print('Traceback (most recent call last):')
+        sys.exit(1)
     if 'crashes' in habits:
         faulthandler.enable()
         os.kill(os.getpid(), signal.SIGSEGV)

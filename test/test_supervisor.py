@@ -192,6 +192,18 @@ def test_a_node_that_crashes_at_its_end_says_where(tmp_path: Path, ledger: Ledge
     assert 'Fatal Python error: Segmentation fault' in sentence and 'in main' in sentence
 
 
+def test_a_node_that_is_interrupted_as_its_interpreter_starts_shows_no_traceback(
+    tmp_path: Path, ledger: Ledger
+) -> None:
+    said: list[Event] = []
+    nodes = [command('cutting', ledger, 'unborn')]
+    with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT, said.append) as supervisor:
+        assert supervisor.start()
+        supervisor.end()
+    (sentence,) = [event.text for event in said if 'did not end well' in event.text]
+    assert sentence.endswith('(exit status 1), see its log')
+
+
 def test_frozen_node_does_not_outlive_the_session(tmp_path: Path, ledger: Ledger) -> None:
     nodes = [command('cutting', ledger, grace=0.2)]
     with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT) as supervisor:
