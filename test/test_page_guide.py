@@ -141,6 +141,25 @@ def test_a_blade_that_is_let_go_comes_out_where_it_is(browser: Browser) -> None:
         assert ways[ends[:-1, 2] < begin[2]].max(initial=0.0) < 0.013  # 0.12 m/s for 0.1 s at most
 
 
+def test_a_press_without_a_motion_before_cuts_where_it_is(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        guided(page)
+        first, other = stand_in.on_top(-0.010, 0.0), stand_in.on_top(0.010, 0.0)
+        places = page.pixels(np.array([first, other]))
+        page.mouse('mouseMoved', *places[0])
+        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], first[:2], atol=1e-3))
+        before, here = places[0][0] + 3, places[1][0]
+        events = f"""for (const [kind, x] of [['move', {before}], ['down', {here}]]) {{
+            const e = {{pointerId: 1, button: 0, buttons: +(kind === 'down'), bubbles: true}};
+            document.querySelector('#view').dispatchEvent(new PointerEvent('pointer' + kind,
+                {{...e, clientX: x, clientY: {places[1][1]}}}));
+        }}"""
+        page.evaluate(f"document.querySelector('#view').setPointerCapture = () => 0; {events}")
+        stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < other[2] - 0.005)
+        assert end_of_blade(stand_in.of(Guide)[-1])[:2] == pytest.approx(other[:2], abs=1e-3)
+
+
 def test_a_palpator_follows_the_pointer_and_presses_no_deeper_than_it_is_set(
     browser: Browser,
 ) -> None:

@@ -101,6 +101,7 @@ export class Guide {
     if (on === this._cuts.has(by)) return;
     if (on && !this._begin()) return;
     const before = this.cutting;
+    if (!before) this._follow();
     if (on) this._cuts.add(by);
     else this._cuts.delete(by);
     if (this.cutting === before) return;
@@ -108,6 +109,9 @@ export class Guide {
       this._waiting = this._path.at(-1) ?? null;
       this._path = [];
       this._push = 0;
+    } else if (this._waiting !== null) { // the blade is still in the tissue
+      this._path = [this._waiting];
+      this._waiting = null;
     }
     this._entered = false;
     this._heading = this.cutting ? this._aim.clone() : null;
@@ -168,8 +172,7 @@ export class Guide {
     this.goal = { position: new Vector3().fromArray(moment.tip), quaternion: new Quaternion(x, y, z, w) };
     const end = this.goal.position.clone().add(this._toEnd());
     const up = this._handle();
-    const ray = { origin: end.clone().add(up), direction: up.clone().negate() };
-    this._aim = surface.hit(ray)?.point ?? end.clone().addScaledVector(up, -end.z);
+    this._aim = surface.upright(end, up)?.point ?? end.clone().addScaledVector(up, -end.z);
     this._level = clamp(end.clone().sub(this._aim).dot(up), HEIGHTS);
     this.height = height ?? this._level;
     return true;
@@ -296,21 +299,29 @@ export class Guide {
       return;
     }
     const end = new Vector3().fromArray(moment.tip).add(this._toEnd());
-    // A blade that is still in the tissue comes out where it is.
-    if (!this.cutting && this._waiting !== null && this._level >= Math.min(0, this.height)) {
-      this._aim = this._waiting;
-      this._waiting = null;
-    }
-    const place = this._aim.clone().addScaledVector(this._handle(), this._level);
-    const way = Math.hypot(end.x - place.x, end.y - place.y);
+    if (!this.cutting) this._follow();
+    const wanted = this._wanted();
+    const way = Math.hypot(end.x - wanted.x, end.y - wanted.y);
     const sinks = this._down(dt, way, moment);
     const moves = this._along(dt) || sinks || way > FAR || this._waiting !== null;
-    const goal = this.goal.position.copy(this._aim).addScaledVector(this._handle(), this._level).sub(this._toEnd());
+    const goal = this.goal.position.copy(this._wanted()).sub(this._toEnd());
     if (!this.cutting) goal.z += clamp(Math.min(way - FAR, this.ceiling - goal.z), [0, MAX_LIFT]);
     this._bound(this.goal.position);
     this._say();
     this.show();
     if (moves) this._timer ??= setTimeout(() => this._advance(), PERIOD_MS);
+  }
+
+  /** Follows the pointer, unless the blade is in the tissue: it comes out where it is. */
+  _follow() {
+    if (this._waiting === null || this._level < Math.min(0, this.height)) return;
+    this._aim = this._waiting;
+    this._waiting = null;
+  }
+
+  /** Where the end of the blade is to be. */
+  _wanted() {
+    return this._aim.clone().addScaledVector(this._handle(), this._level);
   }
 
   /** Moves the level to that of the cut, or of the height; returns whether it goes on. */

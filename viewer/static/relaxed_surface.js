@@ -5,7 +5,7 @@ import { Vector3 } from './vendor/three.module.min.js';
 
 const ABOVE = 1; // [m] from where the surface is looked for downwards
 const FREE = 0; // contact of a moment
-const DOWN = new Vector3(0, 0, -1);
+const UP = new Vector3(0, 0, 1);
 
 export class RelaxedSurface {
   constructor() {
@@ -38,9 +38,9 @@ export class RelaxedSurface {
     return { point, normal: normalAt(part, face, u, v) };
   }
 
-  /** The highest place of the surface over or under a point. */
-  upright(point) {
-    return this.hit({ origin: this._from.copy(point).setZ(point.z + ABOVE), direction: DOWN });
+  /** The first place of the surface on the line through a point, seen against a direction. */
+  upright(point, up = UP) {
+    return this.hit({ origin: this._from.copy(point).addScaledVector(up, ABOVE), direction: up.clone().negate() });
   }
 }
 
