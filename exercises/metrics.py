@@ -58,7 +58,7 @@ class Attempt:
         self._opened = Opened(np.zeros((0, 3)), np.zeros(0))
         self._touched: list[str] = []
         self._pieces = 0
-        self._margin = -math.inf
+        self._margin = NAN
         self._bridge: tuple[int, int] | None = None
 
     def add_motion(self, samples: Floats) -> None:
@@ -219,7 +219,7 @@ class Attempt:
         values: dict[MeasureName, float] = {
             'pieces': float(self._pieces),
             'zones_touched': float(len(self._touched)),
-            'lesion_margin': self._margin if math.isfinite(self._margin) else NAN,
+            'lesion_margin': self._margin,
         }
         areas = self._opened.areas
         total = float(areas.sum())

@@ -267,14 +267,14 @@ def run(make_node: Callable[[], ManagedNode]) -> Any:
     stop = Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    node, problem = None, ''
+    node, problem = None, None
     try:
         node = make_node()
         if node.autostart:
             _start(node)
     except ValueError as error:
-        problem = str(error)
-    if problem or node is None:
+        problem = str(error)  # the error itself holds the node
+    if node is None or problem is not None:
         if node is not None:
             node.destroy_node()
         node = None

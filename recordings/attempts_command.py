@@ -142,7 +142,7 @@ def chosen(store: AttemptStore, subject: str, exercise: str) -> list[AttemptRow]
         SessionError: there are attempts, but none of these.
     """
     rows = store.rows(subject, exercise)
-    if not rows and (known := store.rows('', '')):
+    if not rows and (known := store.rows()):
         asked = ' and '.join(filter(None, (subject, exercise)))
         names = ', '.join(sorted({row.exercise for row in known}))
         raise SessionError(

@@ -181,13 +181,19 @@ def test_node_that_ignores_signals_is_killed_after_its_grace(
     assert not ledger.running()
 
 
-def test_a_node_that_crashes_at_its_end_says_where(tmp_path: Path, ledger: Ledger) -> None:
+def bad_end(folder: Path, ledger: Ledger, habit: str) -> str:
+    """What is said of a node with a habit that is asked to end."""
     said: list[Event] = []
-    nodes = [command('cutting', ledger, 'crashes')]
-    with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT, said.append) as supervisor:
+    nodes = [command('cutting', ledger, habit)]
+    with Supervisor(nodes, folder / 'bag' / 'log', ENVIRONMENT, said.append) as supervisor:
         assert supervisor.start()
         supervisor.end()
     (sentence,) = [event.text for event in said if 'did not end well' in event.text]
+    return sentence
+
+
+def test_a_node_that_crashes_at_its_end_says_where(tmp_path: Path, ledger: Ledger) -> None:
+    sentence = bad_end(tmp_path, ledger, 'crashes')
     assert 'killed by SIGSEGV' in sentence
     assert 'Fatal Python error: Segmentation fault' in sentence and 'in main' in sentence
 
@@ -195,12 +201,7 @@ def test_a_node_that_crashes_at_its_end_says_where(tmp_path: Path, ledger: Ledge
 def test_a_node_that_is_interrupted_as_its_interpreter_starts_shows_no_traceback(
     tmp_path: Path, ledger: Ledger
 ) -> None:
-    said: list[Event] = []
-    nodes = [command('cutting', ledger, 'unborn')]
-    with Supervisor(nodes, tmp_path / 'bag' / 'log', ENVIRONMENT, said.append) as supervisor:
-        assert supervisor.start()
-        supervisor.end()
-    (sentence,) = [event.text for event in said if 'did not end well' in event.text]
+    sentence = bad_end(tmp_path, ledger, 'unborn')
     assert sentence.endswith('(exit status 1), see its log')
 
 
