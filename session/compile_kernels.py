@@ -1,46 +1,48 @@
 """Compile the kernels into their cache: the first session starts as fast as later ones.
 
 Run as `python -m cutting_trainer.session.compile_kernels` for the demo's kernels, and with the
-argument `further` for those of other methods; a second run takes seconds.
+argument `further` for those of other methods; a second run takes seconds. Each group imports for
+itself: imports take seconds, too, and run side by side then.
 """
 
+import fcntl
 import gc
 import os
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from functools import partial
 from multiprocessing import get_context
-
-import numpy as np
-
-from cutting_trainer.cutting.scene_schema import CuttingSettings
-from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
-from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
-from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
-from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
-from cutting_trainer.haptic_bridge.scene_schema import (
-    DeviceSettings,
-    HapticsSettings,
-    ToolSettings,
-    Transform,
-)
-from cutting_trainer.haptic_bridge.warm_up import warm_up as warm_up_force_path
-from cutting_trainer.tissue_sim.mesh.depth import depths_behind_entry
-from cutting_trainer.tissue_sim.warm_up import small_cube, warm_up_method
-from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
+from pathlib import Path
+from typing import Any
 
 
 def main() -> None:
-    """Warm up group by group, on every processor, one line each; then look that nothing lacks."""
-    names = FURTHER if sys.argv[1:] == ['further'] else DEMO
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context('spawn')) as pool:
-        for job in as_completed([pool.submit(timed, name) for name in names]):
+    """Warm up group by group, on every processor, one line each."""
+    groups = FURTHER if sys.argv[1:] == ['further'] else DEMO
+    workers = len(os.sched_getaffinity(0))
+    with ProcessPoolExecutor(workers, get_context('spawn'), share_cache) as pool:
+        for job in as_completed([pool.submit(timed, name) for name in groups]):
             print(job.result(), flush=True)
-    # Two processes that compiled the same kernel at once may have lost one of its signatures.
-    for name in names:
-        timed(name)
+
+
+def share_cache() -> None:
+    """Let one process at a time add to an index of the cache.
+
+    Numba reads the index, adds a signature and writes it. Another process between would lose one.
+    """
+    from numba.core.caching import IndexDataCacheFile
+
+    save = IndexDataCacheFile.save
+
+    def save_alone(file: IndexDataCacheFile, key: Any, data: Any) -> None:
+        folder = Path(os.environ['NUMBA_CACHE_DIR'])
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / 'lock').open('w') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            save(file, key, data)
+
+    IndexDataCacheFile.save = save_alone
 
 
 def timed(name: str) -> str:
@@ -51,14 +53,41 @@ def timed(name: str) -> str:
     return f'{name}: {time.monotonic() - began:.1f} s, CPU {time.process_time() - cpu:.1f} s'
 
 
+def warm_up_tissue() -> None:
+    """Move a tissue by the default integrator."""
+    from cutting_trainer.tissue_sim.warm_up import warm_up_method
+
+    warm_up_method('symplectic_euler')
+
+
+def warm_up_cutting() -> None:
+    """Cut by the default method."""
+    from cutting_trainer.cutting.scene_schema import CuttingSettings
+    from cutting_trainer.cutting.warm_up import warm_up
+
+    warm_up(CuttingSettings())
+
+
 def warm_up_haptics() -> None:
     """Tick the force loop a few times."""
+    from cutting_trainer.haptic_bridge.scene_schema import (
+        DeviceSettings,
+        HapticsSettings,
+        ToolSettings,
+    )
+    from cutting_trainer.haptic_bridge.warm_up import warm_up
+
     device = DeviceSettings()
-    warm_up_force_path(ToolSettings(), device, HapticsSettings(), device.load_profile())
+    warm_up(ToolSettings(), device, HapticsSettings(), device.load_profile())
 
 
 def warm_up_arm() -> None:
     """Move the emulated arm for some periods."""
+    from cutting_trainer.haptic_bridge.emulated_arm.arm import EmulatedArm
+    from cutting_trainer.haptic_bridge.emulated_arm.hand import EmulatedHand, compile_script
+    from cutting_trainer.haptic_bridge.emulated_arm.scene_schema import ArmSettings
+    from cutting_trainer.haptic_bridge.scene_schema import Transform
+
     pose = {'position': [0.0, 0.0, 0.0]}
     phase = {'kind': 'rest'}
     script = {'start': pose, 'phases': [phase]}
@@ -73,22 +102,42 @@ def warm_up_arm() -> None:
     arm.advance(3_000_000, enabled=True)
 
 
+def warm_up_all_integrators() -> None:
+    """Move a tissue by every integrator."""
+    from cutting_trainer.tissue_sim.warm_up import warm_up
+
+    warm_up()
+
+
+def warm_up_deletion() -> None:
+    """Cut by the method that deletes elements."""
+    from cutting_trainer.cutting.scene_schema import CuttingSettings
+    from cutting_trainer.cutting.warm_up import warm_up
+
+    warm_up(CuttingSettings(method='delete'))
+
+
 def warm_up_gauge() -> None:
     """Compute the depth of a blade, as pages and reports do."""
+    import numpy as np
+
+    from cutting_trainer.tissue_sim.mesh.depth import depths_behind_entry
+    from cutting_trainer.tissue_sim.warm_up import small_cube
+
     cube = small_cube()
     depths_behind_entry(np.zeros((1, 2, 3)), cube.rest, cube.triangles)
 
 
 # The longest first: each processor takes the next one.
 DEMO: dict[str, Callable[[], None]] = {
-    'tissue': partial(warm_up_method, 'symplectic_euler'),
-    'cutting': partial(warm_up_cutting, CuttingSettings()),
+    'tissue': warm_up_tissue,
+    'cutting': warm_up_cutting,
     'force loop': warm_up_haptics,
     'emulated arm': warm_up_arm,
 }
 FURTHER: dict[str, Callable[[], None]] = {
-    'tissue by all integrators': warm_up_tissue,
-    'cutting by deletion': partial(warm_up_cutting, CuttingSettings(method='delete')),
+    'tissue by all integrators': warm_up_all_integrators,
+    'cutting by deletion': warm_up_deletion,
     'depth of a blade': warm_up_gauge,
 }
 

@@ -1,9 +1,12 @@
 """No kernel is met first in a session: compiling it would stop the tissue for seconds."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from numba.core.caching import IndexDataCacheFile
 
 pytestmark = pytest.mark.long
 
@@ -92,6 +95,17 @@ for model in MODELS:
 report(before)
 """
 
+SAVE = """
+import sys
+from numba.core.caching import IndexDataCacheFile
+from cutting_trainer.session.compile_kernels import share_cache
+
+share_cache()
+folder, name = sys.argv[1:]
+for number in range(100):
+    IndexDataCacheFile(folder, 'kernel', 'stamp').save((name, number), 'compiled')
+"""
+
 
 def said(program: str, *arguments: str) -> list[str]:
     done = subprocess.run(
@@ -116,3 +130,15 @@ def test_setup_has_compiled_and_nodes_have_loaded_all_that_a_session_calls(scene
 def test_warm_up_leaves_no_kernel_to_be_compiled_in_a_session() -> None:
     (later,) = said(MUCH_CUT)
     assert later.endswith(' loaded later: {}'), later
+
+
+def test_two_processes_that_compile_one_kernel_at_once_lose_no_signature(tmp_path: Path) -> None:
+    environment = os.environ | {'NUMBA_CACHE_DIR': str(tmp_path)}
+    compilers = [
+        subprocess.Popen([sys.executable, '-c', SAVE, str(tmp_path), name], env=environment)
+        for name in 'ab'
+    ]
+    assert [compiler.wait() for compiler in compilers] == [0, 0]
+    saved = IndexDataCacheFile(str(tmp_path), 'kernel', 'stamp')
+    keys = [(name, number) for name in 'ab' for number in range(100)]
+    assert [key for key in keys if saved.load(key) != 'compiled'] == []
