@@ -111,7 +111,7 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
     page.press('record')
     page.wait(lambda: not page.state()['recording'] and not page.state()['busy'], 'the end')
     print(f'{time.monotonic() - began:.1f} s: ended', flush=True)
-    seen.requests = page.requests
+    seen.requests = page.requests()
 
 
 def wait_for_bag(page: Page, seen: Seen) -> None:
@@ -146,9 +146,9 @@ def test_view_ends_in_order_on_ctrl_c(seen: Seen) -> None:
 
 
 def test_page_asks_for_nothing_beyond_this_machine(seen: Seen) -> None:
-    assert seen.requests
+    assert any(url.endswith('.js') for url in seen.requests)
     for url in seen.requests:
-        assert url.startswith(('http://127.0.0.1:', 'ws://127.0.0.1:')), url
+        assert url.startswith('http://127.0.0.1:'), url
 
 
 def test_tissue_is_drawn(seen: Seen) -> None:

@@ -16,6 +16,9 @@ from cutting_trainer.recordings import headless_browser
 from cutting_trainer.recordings.headless_browser import CHROMIUM as CHROMIUM
 from cutting_trainer.recordings.headless_browser import STEP_TIMEOUT_S, run_browser
 
+LOADED = """[...performance.getEntriesByType('navigation'),
+    ...performance.getEntriesByType('resource')].map(entry => entry.name)"""
+
 
 class Page(headless_browser.Page):
     """One page that a person looks at and operates."""
@@ -23,6 +26,10 @@ class Page(headless_browser.Page):
     def reload(self) -> None:
         """Load the page again, without a copy of the old one in the back."""
         self.call('Page.reload')
+
+    def requests(self) -> list[str]:
+        """Return the addresses of all that the page has loaded since it was opened."""
+        return self.evaluate(LOADED)
 
     def picture(self) -> np.ndarray:
         """Return a screenshot, shape (height, width, 3), 0 to 255."""
