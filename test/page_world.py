@@ -127,6 +127,7 @@ class StandIn:
         self._sources = [TissueSource('tissue'), TissueSource('computed')]
         self._ends = threading.Event()
         self.stands_still = threading.Event()
+        self.loses_goals = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self.greet()
         self._thread.start()
@@ -214,7 +215,8 @@ class StandIn:
         elif isinstance(message, SetTissue):
             self.tissue = {'stiffness': message.stiffness, 'toughness': message.toughness}
         elif isinstance(message, Guide):
-            self.goal, self.wxyz = np.array(message.position), list(message.wxyz)
+            if not self.loses_goals:
+                self.goal, self.wxyz = np.array(message.position), list(message.wxyz)
         elif isinstance(message, Record):
             self.recording = '2026-01-01_12-00-00_liver' if message.on else ''
         elif isinstance(message, Scale):

@@ -257,6 +257,20 @@ def test_a_lift_on_a_long_way_ends_no_attempt(browser: Browser) -> None:
         assert places[1][2] + 0.012 < highest < end.centre[2] - end.radius
 
 
+def test_a_goal_that_was_lost_is_sent_again(browser: Browser) -> None:
+    stand_in = StandIn('block')
+    with opened(browser, stand_in) as page:
+        hovering(page, stand_in)
+        stand_in.wait(lambda: np.allclose(stand_in.tip, stand_in.goal, atol=1e-4))
+        stand_in.loses_goals, asked = True, len(stand_in.of(Guide))
+        aside = stand_in.on_top(0.006, 0.004)
+        page.mouse('mouseMoved', *page.pixels(aside[None])[0])
+        stand_in.wait(lambda: len(stand_in.of(Guide)) > asked)
+        time.sleep(0.4)  # until the last one has gone
+        stand_in.loses_goals = False
+        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], aside[:2], atol=1e-3))
+
+
 def test_wheel_keys_and_the_button_that_stays_set_depth_and_cut(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:

@@ -3,6 +3,7 @@
 import { Plane, Quaternion, Raycaster, Vector2, Vector3 } from './vendor/three.module.min.js';
 
 const PERIOD_MS = 1000 / 30;
+const REPEAT_MS = 500; // after which a goal that the tool has not reached is sent again: it may be lost
 const HEIGHT = 0.004, HEIGHTS = [-0.015, 0.03]; // [m] of the blade's end over the surface, without a cut
 const DEPTH = 0.006, DEPTHS = [0, 0.03]; // [m] under it, in a cut
 const NOTCH = 0.0005; // [m] of the wheel
@@ -121,11 +122,14 @@ export class Guide {
 
   /** Shows the goal where it differs from the place of the tool. */
   show() {
-    const { moment, tool } = this._stage;
-    const far = this.goal !== null && moment !== null
-      && this.goal.position.distanceTo(new Vector3().fromArray(moment.tip)) > SHOWN_DISTANCE;
-    tool.showGoal(far ? this.goal : null);
+    this._stage.tool.showGoal(this._isAway() ? this.goal : null);
     this._stage.invalidate();
+  }
+
+  _isAway() {
+    const { moment } = this._stage;
+    return this.goal !== null && moment !== null
+      && this.goal.position.distanceTo(new Vector3().fromArray(moment.tip)) > SHOWN_DISTANCE;
   }
 
   /** Moves the goal along a direction of the view, right or ahead, over the surface; or up [m]. */
@@ -303,7 +307,7 @@ export class Guide {
     const wanted = this._wanted();
     const way = Math.hypot(end.x - wanted.x, end.y - wanted.y);
     const sinks = this._down(dt, way, moment);
-    const moves = this._along(dt) || sinks || way > FAR || this._waiting !== null;
+    const moves = this._along(dt) || sinks || way > FAR || this._waiting !== null || this._isAway();
     const goal = this.goal.position.copy(this._wanted()).sub(this._toEnd());
     if (!this.cutting) goal.z += clamp(Math.min(way - FAR, this.ceiling - goal.z), [0, MAX_LIFT]);
     this._bound(this.goal.position);
@@ -380,8 +384,10 @@ export class Guide {
   _say() {
     const { x, y, z, w } = this.goal.quaternion;
     const told = [...this.goal.position.toArray(), w, x, y, z];
-    if (this._told?.every((value, i) => Math.abs(value - told[i]) < 1e-7)) return;
+    const same = this._told?.every((value, i) => Math.abs(value - told[i]) < 1e-7);
+    if (same && !(this._isAway() && performance.now() - this._toldAt > REPEAT_MS)) return;
     this._told = told;
+    this._toldAt = performance.now();
     this._send(told.slice(0, 3), told.slice(3));
   }
 }
