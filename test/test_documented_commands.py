@@ -198,6 +198,9 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer run dask scheduler': SCHEDULER,
     './trainer run dask worker tcp://HOST:8786 --nthreads 1': SCHEDULER,
     './trainer study config/studies/toughness.yaml --scheduler tcp://HOST:8786': SCHEDULER,
+    './trainer run python config/studies/slurm.py 2': Elsewhere(
+        'test_studies_on_dask.py::test_a_study_on_jobs_of_slurm_makes_the_same_table_to_the_bit'
+    ),
     './trainer clean': Elsewhere('test_launcher.py::test_clean_leaves_nothing_but_the_lock'),
     './trainer record -o BAG --scene block': Elsewhere(
         'test_bags_live.py::'

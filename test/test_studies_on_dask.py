@@ -103,6 +103,50 @@ def test_failures_are_rows_with_their_reasons_and_each_bag_is_computed_as_record
     assert 'toughness=20' in page and 'no stable step' in page
 
 
+SLURM = {
+    'sbatch': """#!/bin/sh
+        cp "$1" "$0.$$.job"
+        setsid sh "$0.$$.job" > "$0.$$.log" 2>&1 &
+        echo "Submitted batch job $!"
+    """,
+    'scancel': """#!/bin/sh
+        kill -- "-$1"
+    """,
+}
+"""The commands of Slurm: a job is a group of processes on this machine."""
+
+
+@pytest.mark.thorough
+def test_a_study_on_jobs_of_slurm_makes_the_same_table_to_the_bit(
+    folder: Path, one_worker: Path
+) -> None:
+    commands = folder / 'slurm'
+    commands.mkdir()
+    for name, text in SLURM.items():
+        (commands / name).write_text(text)
+        (commands / name).chmod(0o755)
+    jobs = subprocess.Popen(
+        [ROOT / 'trainer', 'run', 'python', 'config/studies/slurm.py', '2'],
+        cwd=ROOT,
+        env=os.environ | {'PATH': f'{commands}:{os.environ["PATH"]}'},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert jobs.stdout is not None
+        address, output = jobs.stdout.readline().strip(), folder / 'jobs'
+        study = StudyOptions(folder / 'study.yaml', output, scheduler=address)
+        assert run_study(study) is Status.FAILED
+        assert (output / TABLE_FILE).read_bytes() == (one_worker / TABLE_FILE).read_bytes()
+        with Client(address) as client:
+            assert len(client.nthreads()) == 2
+            workers = [int(pid) for pid in client.run(os.getpid).values()]
+    finally:
+        jobs.send_signal(signal.SIGINT)
+        assert jobs.wait(_TIMEOUT_S) == 0
+    assert not [pid for pid in workers if Path(f'/proc/{pid}').exists()]
+
+
 @pytest.mark.thorough
 def test_two_workers_of_which_one_is_killed_make_the_same_table_to_the_bit(
     folder: Path, one_worker: Path
