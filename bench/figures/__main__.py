@@ -45,7 +45,7 @@ SUBJECTS = {
         together=('blade_phases', 'blade_severance', 'blade_law', 'blade_contact', 'blade_force'),
         not_covered={
             3: 'of the law: edge, spine and flat do not differ',
-            4: 'of it: 64 strokes take 10 minutes: `python -m bench.haptics.random_cuts`',
+            4: 'of it: 64 strokes take 4 minutes: `python -m bench.haptics.random_cuts`',
             5: 'of it: live under load, which takes minutes: `./trainer bench same-cut BAG`',
             7: 'it takes minutes: `./trainer validate`',
             8: 'the pieces are not measured here',

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.speed.tissue import TOUGHNESS
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
@@ -20,13 +19,9 @@ from cutting_trainer.haptic_bridge.scene_schema import HapticsSettings
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.in_process import TICK_S, InProcess, LinkSettings, Tissue
 from cutting_trainer.session.scene_loader import Scene, load_scene
-from cutting_trainer.tissue_sim.assembly import load_tissue
-from cutting_trainer.tissue_sim.contact.blade import Resistance
+from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact
-from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 Floats = NDArray[np.float64]
@@ -115,24 +110,15 @@ class Bench:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._mesh = load_tissue(scene.tissue)
 
     def tissue(self, rate: float, cuts: bool) -> Tissue:
-        """Return the scene's tissue at a rate [Hz], linear; a blade gets in only if it may."""
+        """Return the scene's tissue at a rate [Hz]; a blade gets in only if it may."""
         settings = self.scene.tissue
-        m, d = settings.material, settings.damping
-        simulation = TissueSimulation(
-            TetMesh(*self._mesh),
-            Material(m.youngs_modulus, m.poissons_ratio, m.density, d.alpha, d.beta),
-            Resistance(settings.cut_threshold if cuts else 1e3, TOUGHNESS, m.blade_friction),
-            model='linear_smoothed',
-            stepping=TimeStepping(
-                settings.integrator,
-                rate=rate,
-                safety=settings.integration.safety,
-                max_substeps=settings.integration.max_substeps,
-            ),
-        )
+        changes = {
+            'integration': settings.integration.model_copy(update={'rate': rate}),
+            'cut_threshold': settings.cut_threshold if cuts else 1e3,
+        }
+        simulation, _ = make_simulation(settings.model_copy(update=changes))
         return Tissue(simulation, make_method(self.scene.cutting) if cuts else None)
 
     def path(self, motion: Motion, place: tuple[float, float]) -> Floats:
