@@ -152,7 +152,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     'python -m bench.cuts.severance': Nowhere(
         'takes minutes: test_cutting_severance.py does it to fewer cuts'
     ),
-    'python -m bench.haptics.random_cuts -n 8': Nowhere(
+    'python -m bench.haptics.random_cuts': Nowhere(
         'takes minutes: `bench.figures blade` does it to two strokes'
     ),
     'python -m bench.cuts.loose_pieces': Nowhere(
