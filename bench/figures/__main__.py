@@ -76,7 +76,7 @@ SUBJECTS = {
         modules=('studies_dask', 'studies_arrays'),
         not_covered={
             1: 'of it: 20 bags, 10 settings and 20 kills take minutes',
-            2: 'of it: dask-jobqueue is not tried',
+            2: 'of it: jobs of Slurm: `./trainer test --all -k slurm`',
             3: 'it takes minutes: `python -m bench.trials.identification`',
             4: "of it: LeRobot's own loader, in an environment of its own: "
             '`python -m bench.files.lerobot_loader`',
