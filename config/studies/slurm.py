@@ -4,15 +4,29 @@ Run `./trainer run python config/studies/slurm.py JOBS` where jobs are submitted
 `--scheduler ADDRESS` beside it. The jobs end with this program. Edit what your cluster wants.
 """
 
+import argparse
+import shutil
 import signal
-import sys
+import threading
 from pathlib import Path
 
 from dask_jobqueue import SLURMCluster
 
 TRAINER = Path(__file__).resolve().parents[2] / 'trainer'
 
-if __name__ == '__main__':
+
+def main() -> None:
+    """Submit the jobs, and cancel them on Ctrl-C."""
+    parser = argparse.ArgumentParser(description='Start workers of a study as jobs of Slurm.')
+    parser.add_argument('jobs', type=int, help='how many, one worker each')
+    jobs = parser.parse_args().jobs
+    if jobs < 1:
+        parser.error(f'jobs is {jobs}: give 1 or more')
+    if shutil.which('sbatch') is None:
+        parser.error('sbatch is not on the PATH: run this where jobs of Slurm are submitted')
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
     with SLURMCluster(
         cores=1,  # of a job: one worker, which computes a row at a time
         processes=1,
@@ -20,6 +34,10 @@ if __name__ == '__main__':
         walltime='04:00:00',
         python=f'{TRAINER} run python',
     ) as cluster:
-        cluster.scale(jobs=int(sys.argv[1]))
+        cluster.scale(jobs=jobs)
         print(cluster.scheduler_address, flush=True)
-        signal.sigwait({signal.SIGINT, signal.SIGTERM})
+        ended.wait()
+
+
+if __name__ == '__main__':
+    main()
