@@ -26,3 +26,14 @@ def test_default_keeps_its_bar_while_sliding_at_1_hz_and_holding_the_force_does_
     assert default.peak_newton > 0.2
     assert default.median < held.median
     assert held.p95 > 7.0
+
+
+@pytest.mark.thorough
+def test_default_keeps_its_bar_in_a_cut():
+    cutting = next(motion for motion in MOTIONS if motion.cuts)
+    (row,) = measure(
+        Bench(load_scene('liver')), cutting, places=PLACES[1:], laws=('local_stiffness',)
+    )
+    assert missed_bounds([row]) == []
+    assert row.peak_newton > 2.0
+    assert row.worst < 20.0

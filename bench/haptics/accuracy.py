@@ -97,7 +97,7 @@ MOTIONS = (
     Motion('sliding 2 Hz', _slide(2.0, 0.005, 0.005), 1.0, bar=10.0),
     Motion('tapping 1 Hz', wave(1.0, -0.003, 0.005), 2.0),
     Motion('tapping 2 Hz', wave(2.0, -0.003, 0.005), 1.0),
-    Motion('cutting', _cut, 3.8, cuts=True),
+    Motion('cutting', _cut, 3.8, cuts=True, bar=8.0),
 )
 
 
