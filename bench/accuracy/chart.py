@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from bench.accuracy.measure import Point, measure, reference_cost
+from bench.accuracy.measure import EQUAL_ERROR_RATIO, Point, measure, reference_cost
 from bench.accuracy.panels import Problem, static_problems
 from bench.accuracy.peer_points import peer_points
 from bench.accuracy.picture import draw, draw_regions
@@ -37,14 +37,16 @@ NO_REGION = describe(ActiveSettings(TissueSettings.model_fields['active_region']
 
 _PAGE = """# Speed against accuracy
 
-Written by `./trainer chart`: every elastic model with every integrator, on problems whose solution
-is known by other means (named at the axis). Each scene's method is on the front of the panel that
-resembles it (`test/test_chart.py`). [Others](performance.md#beside-others) bend the beam too.
-[All digits](charts/points.csv).
+Written by `./trainer chart`: elastic models by integrators, on problems whose solution is known by
+other means (named at the axis). Each scene's method is on the front of the panel that resembles it,
+where methods that damp a motion do not count (`test/test_chart.py`).
+[Others](performance.md#beside-others) bend the beam too. [All digits](charts/points.csv).
 
-- **CPU time** is that of one thread at {safety:g} of the stable step. A force of the linear model
-  took {reference_cost:.1f} ns a tetrahedron, and {after:.1f} at the end ({machine}).
-- **Error** belongs to model and mesh; the integrator matters in free vibration only.
+- **CPU time** is that of one thread, for a tissue bent as under its load and let go; explicit
+  steps are {safety:g} of the stable one. A force of the linear model took {reference_cost:.1f} ns
+  a tetrahedron before all measurements, and {after:.1f} after them ({machine}).
+- **Error** belongs to model and mesh; the integrator matters in free vibration only. Scattered
+  nodes are moved at random by up to a fifth of an edge, those inside only.
 - Damping: alpha {alpha:g} 1/s, beta {beta:g} s (active region: {region_alpha:g} 1/s,
   {region_beta:g} s); none in free vibration, where forward Euler has no stable step. Implicit
   steps last a frame, 33 ms; in free vibration also a 4th and a 16th of it.
@@ -163,11 +165,13 @@ def _cost_of(points: list[Point], target: float) -> str:
     }
     percent = f'{100 * target:g} %'
     if not reached:
-        nearest = min(points, key=lambda p: p.displacement_error)
+        least = EQUAL_ERROR_RATIO * min(p.displacement_error for p in points)
+        near = [p for p in points if p.displacement_error <= least]
+        nearest = min(near, key=lambda p: p.cpu_per_second)
         return (
             f'{percent} was not reached on these meshes, the nearest being '
-            f'{100 * nearest.displacement_error:.2g} % by {nearest.model} for '
-            f'{nearest.cpu_per_second:.2g} s a second'
+            f'{100 * nearest.displacement_error:.2g} % with {nearest.model} by '
+            f'{nearest.integrator} for {nearest.cpu_per_second:.2g} s a second'
         )
     (model, integrator), cost = min(reached.items(), key=lambda item: item[1])
     coarsest = cost == _line(points, model, integrator)[0].cpu_per_second

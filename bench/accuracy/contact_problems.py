@@ -15,8 +15,8 @@ _CELLS = {4: (11, 11, 4), 7: (16, 16, 7), 9: (20, 20, 9)}
 _SEED = 1
 _RADIUS, _DEPTH = 0.004, 0.003
 _PLACE = (0.052, 0.049)
-_AROUND = np.array([0.9, 1.0, 1.1])
-"""Depths of a force-depth curve, in shares of the charted one."""
+_AROUND = np.array([1.0, 0.7, 0.8, 0.9, 1.1])
+"""Depths of a force-depth curve, in shares of the charted one, which comes first."""
 
 
 class _OnBlock:
@@ -34,7 +34,7 @@ class FootprintPress(_OnBlock):
     """The sphere presses: its depth under a force, and its force at a depth."""
 
     name = 'footprint'
-    title = 'A sphere of 4 mm presses 3 mm deep, scattered nodes, ν 0.45'
+    title = 'A sphere of radius 4 mm presses 3 mm deep, scattered nodes, ν 0.45'
     reference_name = 'scikit-fem, quadratic triangles of a round layer'
 
     @cached_property
@@ -49,20 +49,22 @@ class FootprintPress(_OnBlock):
         press = self.press(model, resolution)
         depths = _DEPTH * _AROUND
         forces = press.forces(_PLACE, _RADIUS, depths.tolist())
-        depth = np.exp(np.interp(np.log(self.reference), np.log(forces), np.log(depths)))
-        errors = Errors(abs(depth / _DEPTH - 1), abs(forces[1] / self.reference - 1))
-        return Rest(press.model, np.zeros_like(press.model.mesh.rest), errors)
+        by = np.argsort(depths)
+        depth = np.exp(np.interp(np.log(self.reference), np.log(forces[by]), np.log(depths[by])))
+        errors = Errors(abs(depth / _DEPTH - 1), abs(forces[0] / self.reference - 1))
+        return Rest(press.model, press.displacement(_PLACE, _RADIUS, _DEPTH), errors)
 
 
 class Sliding(_OnBlock):
-    """The sphere slides over 3 cm of a block that is the same everywhere: the force's ripple."""
+    """The sphere along 3 cm of a block that is the same everywhere: the force's ripple."""
 
     name = 'sliding'
-    title = 'A sphere of 4 mm slides 3 cm, 3 mm deep, scattered nodes: greatest over least force'
+    title = 'The same at 16 places along 3 cm: greatest over least force, less 1'
     reference_name = 'a force without ripple'
 
     def rest(self, model: ModelName, resolution: int) -> Rest:
         """Return the block, with so many bricks over its height, and greatest over least less 1."""
         press = self.press(model, resolution)
         ripple = sliding_ratio(press) - 1.0
-        return Rest(press.model, np.zeros_like(press.model.mesh.rest), Errors(ripple, ripple))
+        dent = press.displacement(_PLACE, _RADIUS, _DEPTH)
+        return Rest(press.model, dent, Errors(ripple, ripple))

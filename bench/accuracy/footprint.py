@@ -101,6 +101,14 @@ class Press:
             found.append(series.stiffness * depth if linear else series.pushed(depth))
         return np.array(found)
 
+    def displacement(self, place: Sequence[float], radius: float, depth: float) -> Floats:
+        """Return the displacement at rest at a depth [m], shape (n, 3); arguments of `forces`."""
+        (force,) = self.forces(place, radius, [depth])
+        spring = self._spring(place, radius, depth, _STIFF)
+        load = np.zeros_like(self._mesh.rest)
+        load[spring.nodes] = -force * spring.weights[:, None] * _UP
+        return solve_static(self.model, self._free, load, 1e-4)
+
     def _spring(
         self, place: Sequence[float], radius: float, depth: float, stiffness: float
     ) -> Coupling:
