@@ -9,6 +9,7 @@ import fcntl
 import gc
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -36,7 +37,7 @@ def share_cache() -> None:
     save = IndexDataCacheFile.save
 
     def save_alone(file: IndexDataCacheFile, key: Any, data: Any) -> None:
-        folder = Path(os.environ['NUMBA_CACHE_DIR'])
+        folder = Path(os.environ.get('NUMBA_CACHE_DIR') or tempfile.gettempdir())
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / 'lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -135,11 +135,11 @@ def test_a_study_on_jobs_of_slurm_makes_the_same_table_to_the_bit(
     try:
         assert jobs.stdout is not None
         address, output = jobs.stdout.readline().strip(), folder / 'jobs'
-        study = StudyOptions(folder / 'study.yaml', output, scheduler=address)
-        assert run_study(study) is Status.FAILED
-        assert (output / TABLE_FILE).read_bytes() == (one_worker / TABLE_FILE).read_bytes()
         with Client(address) as client:
-            assert len(client.nthreads()) == 2
+            client.wait_for_workers(2, timeout=_TIMEOUT_S)
+            study = StudyOptions(folder / 'study.yaml', output, scheduler=address)
+            assert run_study(study) is Status.FAILED
+            assert (output / TABLE_FILE).read_bytes() == (one_worker / TABLE_FILE).read_bytes()
             workers = [int(pid) for pid in client.run(os.getpid).values()]
     finally:
         jobs.send_signal(signal.SIGINT)

@@ -104,6 +104,7 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
     page.mouse('mouseReleased', *page.pixels(END[None])[0])
     time.sleep(0.7)
     keep('cut')
+    seen.requests = page.requests()
     page.reload()
     page.wait(lambda: page.state().get('meshes'), 'the page again')
     page.wait(lambda: reddish(page.picture()).sum() > 1000, 'the tissue again')
@@ -111,7 +112,7 @@ def use(browser: Browser, url: str, seen: Seen) -> None:
     page.press('record')
     page.wait(lambda: not page.state()['recording'] and not page.state()['busy'], 'the end')
     print(f'{time.monotonic() - began:.1f} s: ended', flush=True)
-    seen.requests = page.requests()
+    seen.requests += page.requests()
 
 
 def wait_for_bag(page: Page, seen: Seen) -> None:

@@ -5,6 +5,7 @@ Run `./trainer run python config/studies/slurm.py JOBS` where jobs are submitted
 """
 
 import argparse
+import shlex
 import shutil
 import signal
 import threading
@@ -25,14 +26,14 @@ def main() -> None:
     if shutil.which('sbatch') is None:
         parser.error('sbatch is not on the PATH: run this where jobs of Slurm are submitted')
     ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: ended.set())
     with SLURMCluster(
         cores=1,  # of a job: one worker, which computes a row at a time
         processes=1,
         memory='1 GiB',
         walltime='04:00:00',
-        python=f'{TRAINER} run python',
+        python=f'{shlex.quote(str(TRAINER))} run python',
     ) as cluster:
         cluster.scale(jobs=jobs)
         print(cluster.scheduler_address, flush=True)

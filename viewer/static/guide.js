@@ -3,7 +3,7 @@
 import { Plane, Quaternion, Raycaster, Vector2, Vector3 } from './vendor/three.module.min.js';
 
 const PERIOD_MS = 1000 / 30;
-const REPEAT_MS = 500; // after which a goal that the tool has not reached is sent again: it may be lost
+const REPEAT_MS = 500, REPEATS = 10; // of a goal after it was sent: it may be lost
 const HEIGHT = 0.004, HEIGHTS = [-0.015, 0.03]; // [m] of the blade's end over the surface, without a cut
 const DEPTH = 0.006, DEPTHS = [0, 0.03]; // [m] under it, in a cut
 const NOTCH = 0.0005; // [m] of the wheel
@@ -89,6 +89,7 @@ export class Guide {
     this._waiting = null; // that of a pointer, until the blade is out of the tissue
     this._path = []; // places of a cut that are still to be passed
     this._push = this._level = 0;
+    this._repeats = 0;
     this._entered = false;
     this._heading = null;
     clearTimeout(this._timer);
@@ -122,14 +123,11 @@ export class Guide {
 
   /** Shows the goal where it differs from the place of the tool. */
   show() {
-    this._stage.tool.showGoal(this._isAway() ? this.goal : null);
-    this._stage.invalidate();
-  }
-
-  _isAway() {
-    const { moment } = this._stage;
-    return this.goal !== null && moment !== null
+    const { moment, tool } = this._stage;
+    const far = this.goal !== null && moment !== null
       && this.goal.position.distanceTo(new Vector3().fromArray(moment.tip)) > SHOWN_DISTANCE;
+    tool.showGoal(far ? this.goal : null);
+    this._stage.invalidate();
   }
 
   /** Moves the goal along a direction of the view, right or ahead, over the surface; or up [m]. */
@@ -307,13 +305,13 @@ export class Guide {
     const wanted = this._wanted();
     const way = Math.hypot(end.x - wanted.x, end.y - wanted.y);
     const sinks = this._down(dt, way, moment);
-    const moves = this._along(dt) || sinks || way > FAR || this._waiting !== null || this._isAway();
+    const moves = this._along(dt) || sinks || way > FAR || this._waiting !== null;
     const goal = this.goal.position.copy(this._wanted()).sub(this._toEnd());
     if (!this.cutting) goal.z += clamp(Math.min(way - FAR, this.ceiling - goal.z), [0, MAX_LIFT]);
     this._bound(this.goal.position);
     this._say();
     this.show();
-    if (moves) this._timer ??= setTimeout(() => this._advance(), PERIOD_MS);
+    if (moves || this._repeats > 0) this._timer ??= setTimeout(() => this._advance(), PERIOD_MS);
   }
 
   /** Follows the pointer, unless the blade is in the tissue: it comes out where it is. */
@@ -385,9 +383,11 @@ export class Guide {
     const { x, y, z, w } = this.goal.quaternion;
     const told = [...this.goal.position.toArray(), w, x, y, z];
     const same = this._told?.every((value, i) => Math.abs(value - told[i]) < 1e-7);
-    if (same && !(this._isAway() && performance.now() - this._toldAt > REPEAT_MS)) return;
+    const now = performance.now();
+    if (same && (this._repeats === 0 || now - this._toldAt < REPEAT_MS)) return;
+    this._repeats = same ? this._repeats - 1 : REPEATS;
     this._told = told;
-    this._toldAt = performance.now();
+    this._toldAt = now;
     this._send(told.slice(0, 3), told.slice(3));
   }
 }
