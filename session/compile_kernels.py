@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -61,12 +62,12 @@ def warm_up_tissue() -> None:
     warm_up_method('symplectic_euler')
 
 
-def warm_up_cutting() -> None:
-    """Cut by the default method."""
+def warm_up_cutting(**settings: Any) -> None:
+    """Cut with settings of the scene's section `cutting`."""
     from cutting_trainer.cutting.scene_schema import CuttingSettings
     from cutting_trainer.cutting.warm_up import warm_up
 
-    warm_up(CuttingSettings())
+    warm_up(CuttingSettings(**settings))
 
 
 def warm_up_haptics() -> None:
@@ -110,14 +111,6 @@ def warm_up_all_integrators() -> None:
     warm_up()
 
 
-def warm_up_deletion() -> None:
-    """Cut by the method that deletes elements."""
-    from cutting_trainer.cutting.scene_schema import CuttingSettings
-    from cutting_trainer.cutting.warm_up import warm_up
-
-    warm_up(CuttingSettings(method='delete'))
-
-
 def warm_up_gauge() -> None:
     """Compute the depth of a blade, as pages and reports do."""
     import numpy as np
@@ -138,7 +131,7 @@ DEMO: dict[str, Callable[[], None]] = {
 }
 FURTHER: dict[str, Callable[[], None]] = {
     'tissue by all integrators': warm_up_all_integrators,
-    'cutting by deletion': warm_up_deletion,
+    'cutting by deletion': partial(warm_up_cutting, method='delete'),
     'depth of a blade': warm_up_gauge,
 }
 

@@ -42,6 +42,12 @@ def hovering(page: Page, stand_in: StandIn) -> tuple[np.ndarray, Any, Any]:
     return top, x, y
 
 
+def come_over(page: Page, stand_in: StandIn, place: np.ndarray) -> None:
+    """Lets the tool come over a place of the tissue [m]."""
+    page.mouse('mouseMoved', *page.pixels(place[None])[0])
+    stand_in.wait(lambda: np.allclose(stand_in.tip[:2], place[:2], atol=1e-3))
+
+
 def end_of_blade(goal: Guide) -> np.ndarray:
     """Where the blade ends at a goal [m]."""
     w, *turn = goal.wxyz
@@ -128,8 +134,7 @@ def test_a_blade_that_is_let_go_comes_out_where_it_is(browser: Browser) -> None:
         guided(page)
         begin, end = stand_in.on_top(-0.010, 0.0), stand_in.on_top(0.012, 0.0)
         places = page.pixels(np.array([begin, end]))
-        page.mouse('mouseMoved', *places[0])
-        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], begin[:2], atol=1e-3))
+        come_over(page, stand_in, begin)
         page.mouse('mousePressed', *places[0], pressed=True)
         stand_in.wait(lambda: end_of_blade(stand_in.of(Guide)[-1])[2] < begin[2] - 0.006)
         page.mouse('mouseMoved', *places[1], pressed=True)
@@ -147,8 +152,7 @@ def test_a_press_without_a_motion_before_cuts_where_it_is(browser: Browser) -> N
         guided(page)
         first, other = stand_in.on_top(-0.010, 0.0), stand_in.on_top(0.010, 0.0)
         places = page.pixels(np.array([first, other]))
-        page.mouse('mouseMoved', *places[0])
-        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], first[:2], atol=1e-3))
+        come_over(page, stand_in, first)
         before, here = places[0][0] + 3, places[1][0]
         events = f"""for (const [kind, x] of [['move', {before}], ['down', {here}]]) {{
             const e = {{pointerId: 1, button: 0, buttons: +(kind === 'down'), bubbles: true}};
@@ -205,8 +209,7 @@ def test_no_goal_jumps_and_the_edge_turns_to_the_stroke(browser: Browser) -> Non
         guided(page)
         begin, end = stand_in.on_top(0.0, -0.010), stand_in.on_top(0.0, 0.010)
         places = page.pixels(np.linspace(begin, end, 6))
-        page.mouse('mouseMoved', *places[0])
-        stand_in.wait(lambda: np.allclose(stand_in.tip[:2], begin[:2], atol=1e-3))
+        come_over(page, stand_in, begin)
         before = len(stand_in.of(Guide))
         page.mouse('mousePressed', *places[0], pressed=True)
         page.mouse('mouseMoved', *places[-1], pressed=True)
@@ -251,8 +254,7 @@ def test_a_lift_on_a_long_way_ends_no_attempt(browser: Browser) -> None:
         places = [stand_in.on_top(x, 0.0) for x in (-0.022, end.centre[0])]
         for place in places:
             before = len(stand_in.of(Guide))
-            page.mouse('mouseMoved', *page.pixels(place[None])[0])
-            stand_in.wait(lambda place=place: np.allclose(stand_in.tip[:2], place[:2], atol=1e-3))
+            come_over(page, stand_in, place)
         highest = max(goal.position[2] for goal in stand_in.of(Guide)[before:])
         assert places[1][2] + 0.012 < highest < end.centre[2] - end.radius
 

@@ -15,8 +15,8 @@ _CELLS = {4: (11, 11, 4), 7: (16, 16, 7), 9: (20, 20, 9)}
 _SEED = 1
 _RADIUS, _DEPTH = 0.004, 0.003
 _PLACE = (0.052, 0.049)
-_AROUND = np.array([1.0, 0.7, 0.8, 0.9, 1.1])
-"""Depths of a force-depth curve, in shares of the charted one, which comes first."""
+_AROUND = np.array([0.7, 0.8, 0.9, 1.0, 1.1])
+"""Depths of a force-depth curve, in shares of the charted one."""
 
 
 class _OnBlock:
@@ -49,9 +49,9 @@ class FootprintPress(_OnBlock):
         press = self.press(model, resolution)
         depths = _DEPTH * _AROUND
         forces = press.forces(_PLACE, _RADIUS, depths.tolist())
-        by = np.argsort(depths)
-        depth = np.exp(np.interp(np.log(self.reference), np.log(forces[by]), np.log(depths[by])))
-        errors = Errors(abs(depth / _DEPTH - 1), abs(forces[0] / self.reference - 1))
+        force = np.interp(_DEPTH, depths, forces)
+        depth = np.exp(np.interp(np.log(self.reference), np.log(forces), np.log(depths)))
+        errors = Errors(abs(depth / _DEPTH - 1), abs(force / self.reference - 1))
         return Rest(press.model, press.displacement(_PLACE, _RADIUS, _DEPTH), errors)
 
 

@@ -104,10 +104,7 @@ class Press:
     def displacement(self, place: Sequence[float], radius: float, depth: float) -> Floats:
         """Return the displacement at rest at a depth [m], shape (n, 3); arguments of `forces`."""
         (force,) = self.forces(place, radius, [depth])
-        spring = self._spring(place, radius, depth, _STIFF)
-        load = np.zeros_like(self._mesh.rest)
-        load[spring.nodes] = -force * spring.weights[:, None] * _UP
-        return solve_static(self.model, self._free, load, 1e-4)
+        return -force * self._lifted(self._spring(place, radius, depth, _STIFF))
 
     def _spring(
         self, place: Sequence[float], radius: float, depth: float, stiffness: float
@@ -130,10 +127,13 @@ class Press:
         return self._springs.spring(contact, 0.0, depth)
 
     def _compliance(self, spring: Coupling) -> float:
+        return float(spring.weights @ self._lifted(spring)[spring.nodes, 2])
+
+    def _lifted(self, spring: Coupling) -> Floats:
+        """Return the displacement by a spring that lifts with 1 N [m], shape (n, 3)."""
         load = np.zeros_like(self._mesh.rest)
         load[spring.nodes] = spring.weights[:, None] * _UP
-        moved = solve_static(self.model, self._free, load, 1e-4)
-        return float(spring.weights @ moved[spring.nodes, 2])
+        return solve_static(self.model, self._free, load, 1e-4)
 
 
 def main() -> None:
