@@ -8,10 +8,10 @@ from meshes import irregular_box
 from test_blade import TOUGHNESS, contact_at
 from test_blade_lag import eased
 
-from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
+from cutting_trainer.tissue_sim.contact.blade import Blade, Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.tool import CutCommand
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.mesh.locate import find_tetrahedra
+from cutting_trainer.tissue_sim.mesh.locate import NearElements, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
@@ -129,3 +129,24 @@ def test_nothing_is_left_out_between_two_sweeps_where_the_tissue_bends_the_edge(
     ahead = np.array(Drawn(0.0, youngs_modulus=5000.0).ahead)
     assert np.isfinite(ahead).sum() > 100
     assert np.nanmax(ahead) < 5e-5  # a hundredth of an edge
+
+
+def test_an_edge_that_leaves_just_after_a_cut_does_not_ask_for_nodes_of_the_old_mesh() -> None:
+    def box(cells: int) -> TetMesh:
+        nodes, tets = irregular_box((cells, cells, cells), 0.02 / cells, 3, jitter=0.1)
+        return TetMesh(nodes, tets)
+
+    before, after = box(4), box(2)
+    tip = np.array([0.01, 0.01, 0.012])
+    edge = np.array([tip + [0.0, 0.0, 0.012], tip])
+    blade = Blade(Resistance(0.05, TOUGHNESS, 0.0), *edge, hint=0)
+    still = np.zeros((2, 3))
+    for mesh, height in ((before, 0.0), (after, 0.02)):
+        blade.untie()  # the mesh is a new one
+        near, opened = NearElements(mesh.tetrahedra), mesh.triangles[:0]
+        device = edge + [0.0, 0.0, height]
+        blade.follow(mesh, near, opened, mesh.rest, device, still, 80.0, np.zeros(3))
+    assert blade.immersed == 0.0
+    kept = blade.kept()
+    blade.carry(after.rest + [0.001, 0.0, 0.0])
+    assert np.array_equal(blade.kept()['_tip'], kept['_tip'])

@@ -150,7 +150,7 @@ class Blade:
         self._back: np.ndarray | None = None
         self._from: Anchor | None = None
         self._to: Anchor | None = None
-        self._failed = self._set_back = False
+        self._failed = self._set_back = self._renumbered = False
         self.paid = self.rubbed = self._swept = 0.0
         self._settle(no_pull())
 
@@ -248,7 +248,7 @@ class Blade:
             some = mesh.tetrahedra[:: 1 + len(mesh.tetrahedra) // _MEDIAN_SAMPLES]
             volumes = tetrahedron_volumes(mesh.rest, some)
             self._element = 2 * float(np.cbrt(np.median(volumes)))
-        before, anchor = self._device, anchor_of(self._state)
+        before, anchor = self._device, self._anchor()
         self._device, self._moved = device.copy(), points_of(moved)
         self._law = self._law._replace(stiffness=stiffness / WHOLE, facing=facing)
         points, edge = points_of(device), self._state.points
@@ -261,6 +261,7 @@ class Blade:
             positions, mesh.rest, mesh.tetrahedra, mesh.neighbors, among, opened, mesh.regions
         )
         pull = follow_device(self._state, self._strips, points, self._moved, tissue, self._law)
+        self._renumbered = False
         if self._to is not None and self._state.spans.any():
             self._come_back(before)
         self._settle(pull)
@@ -269,8 +270,13 @@ class Blade:
 
     def leave(self) -> None:
         """Take the blade out of the tissue where it is; its last sweep can be asked for."""
-        self._leave(anchor_of(self._state))
+        self._leave(self._anchor())
         self._state.spans[:] = 0.0
+
+    def _anchor(self) -> Anchor | None:
+        """Return the anchor of the edge, which stays where it is if the mesh has changed since."""
+        anchor = anchor_of(self._state)
+        return anchor.loose() if anchor is not None and self._renumbered else anchor
 
     def _leave(self, anchor: Anchor | None) -> None:
         """Keep the sweep of an edge that leaves the tissue, and let it go with the tissue.
@@ -291,8 +297,8 @@ class Blade:
             self._from = None
 
     def untie(self) -> None:
-        """Let the last sweep of an edge that has left stay where it is: the mesh has changed."""
-        self._from = None
+        """Let the last sweep of an edge that leaves stay where it is: the mesh has changed."""
+        self._from, self._renumbered = None, True
         if self._to is not None:
             self._to = self._to.loose()
 
