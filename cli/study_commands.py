@@ -56,7 +56,9 @@ def identify(
     refine: Annotated[
         bool,
         typer.Option(
-            '--refine', help='Compute on the mesh refined once: 1.5 to 16 times the time.'
+            '--refine',
+            help='Search on, on the mesh refined once: 2 to 16 times the time. Intervals hold the '
+            'error of the mesh then.',
         ),
     ] = False,
     workers: Workers = 0,

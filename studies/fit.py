@@ -1,15 +1,15 @@
 """Search for the constants under which computed forces are nearest to recorded ones."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 from scipy.stats import qmc
 
 from cutting_trainer.studies.identification import (
-    MESH_SHARE,
     Linearised,
     Prior,
     deviations,
@@ -18,8 +18,9 @@ from cutting_trainer.studies.identification import (
 
 Floats = NDArray[np.float64]
 
-DIFFERENCE = 0.1
-"""Step of the central differences of logarithms: cuts go on from element to element."""
+DIFFERENCE = 0.2
+"""Step of the central differences of logarithms: a cut goes on from element to element, and a
+smaller step divides its jumps by less."""
 START_POINTS = 3
 """Points of the start's design for each unknown."""
 MAX_STEPS = 8
@@ -31,6 +32,8 @@ _TOLERANCE = 1e-3
 _FAILED = 10.0
 """Residual of a point that cannot be computed, in recorded forces."""
 _SEED = 0
+_JUMP_WINDOWS = 5
+"""Windows over which the variance of jumps is averaged: they come earlier or later."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +63,6 @@ class Fit:
         priors: of the unknowns, by name.
         noise: of the force for one sample of one component [N].
         compute: re-simulates.
-
-    Attributes:
-        computed: number of re-simulations.
     """
 
     def __init__(
@@ -72,9 +72,9 @@ class Fit:
         noise: float,
         compute: Compute,
     ) -> None:
-        self.computed = 0
         self._observations, self._priors, self._compute = observations, priors, compute
-        self._deviations = [deviations(o.times, o.felt, noise) for o in observations]
+        self._without_jumps = [deviations(o.times, o.felt, noise) for o in observations]
+        self._deviations = list(self._without_jumps)
         self._felt = [window_means(o.times, o.felt) for o in observations]
         self._mean = np.log([prior.median for prior in priors.values()])
         self._spread = np.array([prior.spread for prior in priors.values()])
@@ -82,14 +82,14 @@ class Fit:
         self._untouched: set[tuple[int, int]] = set()
         self._scale = 1.0
 
-    def solve(self, recorded: Floats, confidence: float) -> Linearised:
+    def solve(self, begin: Floats, confidence: float) -> Linearised:
         """Return the problem linearised around its solution.
 
         Args:
-            recorded: logarithms of the constants of the scene, shape (p,); NaN: it has none.
+            begin: logarithms of the constants where the search begins, shape (p,).
             confidence: of the intervals.
         """
-        begin = self._start(np.where(np.isfinite(recorded), recorded, self._mean))
+        self._allow_for_jumps(begin)
         # Of the prior only the share counts that the fit of the start leaves to it.
         misfit = np.concatenate(self._residuals(begin))
         self._scale = float(np.sqrt(np.mean(misfit**2))) or 1.0
@@ -105,6 +105,7 @@ class Fit:
             ftol=_TOLERANCE,
             max_nfev=MAX_STEPS,
         )
+        self._allow_for_jumps(found.x)
         return Linearised(
             names=tuple(self._priors),
             at=found.x,
@@ -113,26 +114,9 @@ class Fit:
             prior_mean=self._mean,
             prior_spread=self._spread,
             confidence=confidence,
+            recorded=[self._weighted(bag, o.felt) for bag, o in enumerate(self._observations)],
+            deviations=self._deviations,
         )
-
-    def with_mesh(
-        self, problem: Linearised, other: Sequence[Floats], *, is_refined: bool
-    ) -> Linearised:
-        """Return the problem with the error of the mesh.
-
-        Args:
-            problem: without it.
-            other: forces of each bag on the other mesh at the solution [N], each (n, 3).
-            is_refined: the problem is that of the refined mesh, and the other one is coarser.
-        """
-        point, sign = self._point(problem.at), -1.0 if is_refined else 1.0
-        changes = [
-            sign * self._weighted(bag, forces - self._known[bag, point])
-            for bag, forces in enumerate(other)
-        ]
-        # What is left of the error of the coarser mesh after one refinement.
-        left = MESH_SHARE - 1.0 if is_refined else MESH_SHARE
-        return replace(problem, mesh=changes, mesh_share=left)
 
     def forces(self, at: Floats) -> list[Floats]:
         """Return the computed forces of all bags [N], each of shape (n, 3)."""
@@ -141,8 +125,13 @@ class Fit:
         self._need([(bag, point) for bag in bags])
         return [self._known[bag, point] for bag in bags]
 
-    def _start(self, recorded: Floats) -> Floats:
-        """Return the best point of a Latin hypercube and the recorded values, on a few bags."""
+    def start(self, recorded: Floats) -> Floats:
+        """Return the best point of a Latin hypercube and the recorded values, on a few bags.
+
+        Args:
+            recorded: logarithms of the constants of the scene, shape (p,); NaN: it has none.
+        """
+        recorded = np.where(np.isfinite(recorded), recorded, self._mean)
         unknowns = len(self._mean)
         design = qmc.LatinHypercube(unknowns, rng=np.random.default_rng(_SEED))
         samples = 2.0 * design.random(START_POINTS * unknowns) - 1.0
@@ -178,9 +167,7 @@ class Fit:
         return self._weighted(bag, felt - computed)
 
     def _jacobians(self, at: Floats) -> list[Floats]:
-        bags, unknowns = range(len(self._observations)), range(len(at))
-        steps = DIFFERENCE * np.eye(len(at))
-        ends = [(self._point(at + step), self._point(at - step)) for step in steps]
+        bags, unknowns, ends = range(len(self._observations)), range(len(at)), self._ends(at)
         touched = [(bag, i) for bag in bags for i in unknowns if (bag, i) not in self._untouched]
         self._need([(bag, point) for bag, i in touched for point in ends[i]])
         self.forces(at)
@@ -203,6 +190,31 @@ class Fit:
             for bag in bags
         ]
 
+    def _ends(self, at: Floats) -> list[tuple[Point, Point]]:
+        """Return the ends of the central difference along each unknown."""
+        steps = DIFFERENCE * np.eye(len(at))
+        return [(self._point(at + step), self._point(at - step)) for step in steps]
+
+    def _allow_for_jumps(self, at: Floats) -> None:
+        """Widen the deviations by the jumps of the computed forces around a point.
+
+        A tissue that breaks in or parts a little earlier changes a force at once. Such jumps, of
+        the same variance at three points, have six times that variance as a second difference.
+        """
+        self._jacobians(at)  # computes them
+        for bag, without in enumerate(self._without_jumps):
+            middle = self._known[bag, self._point(at)]
+            second = [
+                self._known[bag, up] + self._known[bag, down] - 2.0 * middle
+                for i, (up, down) in enumerate(self._ends(at))
+                if (bag, i) not in self._untouched
+            ]
+            times = self._observations[bag].times
+            squares = [np.mean(window_means(times, each) ** 2, axis=1) / 6.0 for each in second]
+            squares = [each for each in squares if not np.isnan(each).any()] or [np.zeros(1)]
+            jumps = uniform_filter1d(np.mean(squares, axis=0), _JUMP_WINDOWS, mode='nearest')
+            self._deviations[bag] = np.sqrt(without**2 + jumps[:, None])
+
     def _weighted(self, bag: int, forces: Floats) -> Floats:
         """Return window means over their deviations, shape (3 windows,); 0 where none is known."""
         means = window_means(self._observations[bag].times, forces)
@@ -214,5 +226,4 @@ class Fit:
     def _need(self, wanted: Iterable[tuple[int, Point]]) -> None:
         missing = [each for each in dict.fromkeys(wanted) if each not in self._known]
         if missing:
-            self.computed += len(missing)
             self._known |= self._compute(missing)

@@ -7,9 +7,11 @@ whose correlation in time widens it. The posterior is Gaussian around its maximu
 *Information Theory, Inference, and Learning Algorithms*, 2003, chapter 27). A bootstrap over bags,
 one Gauss-Newton step each, checks it: hands differ by more than noise.
 
-The mesh errs, too: a bag computed on the mesh refined once gives the direction in which its forces
-still change. Quadratic convergence would move them by 4/3 of it (Richardson); each bag has a share
-of its own, because the error depends on where the tool meets the elements. It is marginalised.
+All computed forces may be off by one share, by the mesh, the law or the device. That moves the
+estimates and does not average out, so it widens the intervals by itself.
+
+The estimates of a finer mesh differ from those of the recorded one; that change
+is extrapolated, with an uncertainty of its own (Roache, *Journal of Fluids Engineering* 116, 1994).
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,9 +34,12 @@ PARAMETERS = {
     'friction': '-',
 }
 """Constants of `tissue.material` that can be identified, and their units."""
-MESH_SHARE, MESH_SHARE_SPREAD = 4.0 / 3.0, 2.0 / 3.0
-"""Mean and standard deviation of the share of that change: quadratic convergence, and between none
-and linear. On the refined mesh one whole change less is left."""
+FORCE_SPREAD = 0.05
+"""Standard deviation of that share: forces under a tool differ by up to 10 % between meshes."""
+MESH_LEFT, MESH_LEFT_SPREAD = 1.0 / 3.0, 1.0 / 3.0
+"""Mean and standard deviation of what a finer mesh would still change, as a share of what the first
+refinement changed: a third where errors are quadratic in the size of elements; linear ones (1) and
+none (0) lie within two deviations."""
 WINDOW_S = 0.05
 MODEL_ERROR = 0.1
 """Error of the model as a share of the force, before its scale is estimated."""
@@ -50,6 +55,8 @@ _UNCLEAR = 0.3
 """Half of an interval, as a logarithm, above which the correlated constant is named."""
 _CORRELATED = 0.9
 _SCALE_ROUNDS = 3
+_TAIL = float(student.ppf(0.975, 1e6))
+"""Half of an interval of 95 % of a normal distribution, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +130,11 @@ class Linearised:
         jacobians: of the computed values, each shape (m, p).
         prior_mean, prior_spread: shape (p,).
         confidence: of the intervals.
-        mesh: change of the computed values of each bag by a finer mesh, each shape (m,); (): not
-            known.
-        mesh_share: mean share of that change by which the computed values are off.
+        recorded: window means of the recorded force over their deviations, each shape (m,).
+        deviations: of the window means of each bag [N], each shape (windows, 3), before the common
+            scale; () where they are not needed.
+        mesh_change: of the unknowns from the recorded mesh to the refined one that this problem is
+            about, shape (p,); None: it is about the recorded one.
     """
 
     names: tuple[str, ...]
@@ -135,37 +144,24 @@ class Linearised:
     prior_mean: Floats
     prior_spread: Floats
     confidence: float = 0.95
-    mesh: Sequence[Floats] = ()
-    mesh_share: float = MESH_SHARE
+    recorded: Sequence[Floats] = ()
+    deviations: Sequence[Floats] = ()
+    mesh_change: Floats | None = None
 
     @cached_property
-    def _white(self) -> tuple[list[Floats], list[Floats], float]:
-        """Residuals and Jacobians without the error of the mesh, and the variance of a residual."""
-        raw = list(self.residuals)
-        if self.mesh:
-            raw = [r - self.mesh_share * of for r, of in zip(raw, self.mesh, strict=True)]
-        residuals, jacobians, scale = raw, list(self.jacobians), _variance(raw, len(self.names))
-        for _ in range(_SCALE_ROUNDS):
-            if self.mesh:
-                residuals, jacobians = (
-                    [_without(x, change, scale) for x, change in zip(of, self.mesh, strict=True)]
-                    for of in (raw, self.jacobians)
-                )
-            step = self._step(residuals, jacobians, scale)
-            left = [r - j @ step for r, j in zip(residuals, jacobians, strict=True)]
-            scale = _variance(left, len(self.names))
-        return residuals, jacobians, scale
-
-    @property
     def scale(self) -> float:
         """Variance of a residual, widened by the correlation of neighbours in time."""
-        return self._white[2]
+        scale = _variance(self.residuals, len(self.names))
+        for _ in range(_SCALE_ROUNDS):
+            step = self._step(scale)
+            left = [r - j @ step for r, j in zip(self.residuals, self.jacobians, strict=True)]
+            scale = _variance(left, len(self.names))
+        return scale
 
     @cached_property
     def information(self) -> Floats:
         """Information of the bags without the prior, shape (p, p)."""
-        _, jacobians, scale = self._white
-        return np.asarray(sum(j.T @ j for j in jacobians) / scale, float)
+        return np.asarray(sum(j.T @ j for j in self.jacobians) / self.scale, float)
 
     @cached_property
     def covariance(self) -> Floats:
@@ -178,27 +174,28 @@ class Linearised:
         Args:
             weights: how often each bag counts, shape (bags,); None: once.
         """
-        return self._step(*self._white, weights)
+        return self._step(self.scale, weights)
 
-    def _step(
-        self,
-        residuals: Sequence[Floats],
-        jacobians: Sequence[Floats],
-        scale: float,
-        weights: Floats | None = None,
-    ) -> Floats:
-        counts = np.ones(len(residuals)) if weights is None else weights
-        parts = list(zip(counts, jacobians, residuals, strict=True))
+    def _step(self, scale: float, weights: Floats | None = None) -> Floats:
+        counts = np.ones(len(self.residuals)) if weights is None else weights
+        parts = list(zip(counts, self.jacobians, self.residuals, strict=True))
         matrix = sum(n * (j.T @ j) for n, j, _ in parts) / scale
         precision = self.prior_spread**-2.0
         pull = sum(n * (j.T @ r) for n, j, r in parts) / scale
         pull = pull + precision * (self.prior_mean - self.at)
         return np.asarray(np.linalg.solve(matrix + np.diag(precision), pull), float)
 
+    @cached_property
+    def by_force(self) -> Floats:
+        """Change of the unknowns by a relative change of all recorded forces, shape (p,)."""
+        pull = sum(j.T @ f for j, f in zip(self.jacobians, self.recorded, strict=True))
+        return np.asarray(self.covariance @ pull / self.scale, float)
+
     def bootstrap_spread(self, seed: int = 0) -> Floats | None:
         """Return standard deviations over bags drawn with replacement, shape (p,).
 
-        None: there are fewer than `MIN_BOOTSTRAP_BAGS`.
+        They are those of a normal distribution with the same interval of 95 %: a rare draw without
+        any cut would decide a second moment. None: there are fewer than `MIN_BOOTSTRAP_BAGS`.
         """
         bags = len(self.residuals)
         if bags < MIN_BOOTSTRAP_BAGS:
@@ -206,23 +203,34 @@ class Linearised:
         random = np.random.default_rng(seed)
         draws = random.multinomial(bags, np.full(bags, 1.0 / bags), RESAMPLES)
         steps = np.array([self.step(draw.astype(float)) for draw in draws])
-        return np.asarray(steps.std(axis=0, ddof=1) * np.sqrt(bags / (bags - 1.0)))
+        low, high = np.quantile(steps, [0.025, 0.975], axis=0)
+        return np.asarray((high - low) / (2.0 * _TAIL) * np.sqrt(bags / (bags - 1.0)))
 
     @cached_property
     def half_widths(self) -> Floats:
-        """Half of the interval of each unknown: the wider of Laplace and bootstrap, shape (p,)."""
+        """Half of the interval of each unknown, shape (p,).
+
+        It is the wider of Laplace and bootstrap, and independent of that the common error of all
+        forces and that of the mesh.
+        """
         tail = 0.5 + self.confidence / 2.0
         widths = np.sqrt(np.diag(self.covariance)) * student.ppf(tail, 1e6)
         spread = self.bootstrap_spread()
         if spread is not None:
             widths = np.maximum(widths, spread * student.ppf(tail, len(self.residuals) - 1))
+        common = [FORCE_SPREAD * self.by_force] if self.recorded else []
+        if self.mesh_change is not None:
+            common.append(MESH_LEFT_SPREAD * self.mesh_change)
+        for each in common:
+            widths = np.hypot(widths, each * student.ppf(tail, 1e6))
         # Bags that say nothing leave the prior, and no more than that.
         return np.asarray(np.minimum(widths, self.prior_spread * student.ppf(tail, 1e6)))
 
     @cached_property
     def estimates(self) -> Floats:
-        """The unknowns at the maximum of the posterior, shape (p,)."""
-        return self.at + self.step()
+        """The unknowns at the maximum of the posterior, shape (p,), extrapolated to a fine mesh."""
+        found = self.at + self.step()
+        return found if self.mesh_change is None else found + MESH_LEFT * self.mesh_change
 
 
 def _variance(residuals: Sequence[Floats], unknowns: int) -> float:
@@ -232,16 +240,6 @@ def _variance(residuals: Sequence[Floats], unknowns: int) -> float:
     lagged = sum(float(r[3:] @ r[:-3]) for r in residuals)  # three components a window
     rho = min(max(lagged / total, 0.0), 0.9) if total > 0.0 else 0.0
     return max(total / max(count - unknowns, 1), 1e-12) * (1.0 + rho) / (1.0 - rho)
-
-
-def _without(values: Floats, change: Floats, scale: float) -> Floats:
-    """Return values, shape (m,) or (m, p), whitened by an error along the change by the mesh."""
-    size = float(change @ change)
-    if size == 0.0:
-        return values
-    taken = 1.0 - 1.0 / np.sqrt(1.0 + MESH_SHARE_SPREAD**2 * size / scale)
-    along = change / np.sqrt(size)
-    return np.asarray(values - taken * np.multiply.outer(along, along @ values), float)
 
 
 @dataclass(frozen=True)

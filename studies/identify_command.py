@@ -5,7 +5,8 @@ import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -37,10 +38,14 @@ from cutting_trainer.studies.identification_page import write_identification_pag
 from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.refined_mesh import write_refined
 from cutting_trainer.studies.study_command import NO_DASK
-from cutting_trainer.tissue_sim.scene_schema import MaterialSettings
+from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MATERIAL_FILE, RESULT_FILE = 'material.yaml', 'identification.json'
 PAGE_FILE = 'identification.html'
+CONFIDENCE = 0.95
+ON_RECORDED_MESH = 'the intervals are without the error of the mesh: --refine adds it'
+LOCKING = ('linear', 'corotational')
+"""Models whose elements are too stiff where tissue hardly changes its volume."""
 _KEY = 'tissue.material'
 _MESH_KEY = 'tissue.mesh'
 
@@ -55,7 +60,7 @@ class IdentifyOptions:
         parameters: names of the constants; (): those that the scene has and hands may touch.
         noise: of the force for one sample of one component [N].
         changes: of the scene, by dotted key, in YAML.
-        refine: compute on the mesh refined once, and once more on the recorded one.
+        refine: search on, on the mesh refined once.
         workers: number of own workers; 0: one for each processor.
         scheduler: address of a scheduler with workers; '': own workers.
         as_json: print the outcome as JSON.
@@ -158,26 +163,33 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
     if _MESH_KEY in changes:
         changes[_MESH_KEY] = str(Path(changes[_MESH_KEY]).resolve())
     observations = [_observe(bag) for bag in bags]
-    material = _material(bags[0], options.changes)
+    tissue = _tissue(bags[0], options.changes)
+    material = tissue.material
     names = options.parameters or tuple(
         name for name in PARAMETERS if getattr(material, name) > 0.0
     )
     priors = {name: prior_of(name, getattr(material, name)) for name in names}
-    folder = options.output.resolve()
-    refined = [
-        write_refined(read_recording(str(bag.path), bag.hash).bag, folder, options.changes)
-        for bag in bags
-    ]
-    running = _Running(bags, names, changes, client, refined, on_refined=options.refine)
-    fit = Fit(observations, priors, options.noise, running.compute)
     with np.errstate(divide='ignore'):
         recorded = np.log([getattr(material, name) for name in names])
-    problem = fit.solve(recorded, confidence=0.95)
-    other, without = running.on_other_mesh(problem.at)
-    notes = [without] if without else []
-    if not without:
-        problem = fit.with_mesh(problem, other, is_refined=options.refine)
-    forces = fit.forces(problem.at)
+    running = _Running(bags, names, changes, client)
+    fit = Fit(observations, priors, options.noise, running.compute)
+    problem = fit.solve(fit.start(recorded), CONFIDENCE)
+    notes = [] if options.refine else [ON_RECORDED_MESH]
+    if tissue.model in LOCKING:
+        notes.append(
+            f'the force of the model {tissue.model} depends on the mesh: '
+            '--with tissue.model=stiffening does not'
+        )
+    if options.refine:
+        coarse = problem.estimates
+        folder = options.output.resolve()
+        refined = [
+            str(write_refined(read_recording(str(bag.path), bag.hash).bag, folder, options.changes))
+            for bag in bags
+        ]
+        fit = Fit(observations, priors, options.noise, partial(running.compute, meshes=refined))
+        problem = fit.solve(coarse, CONFIDENCE)
+        problem = replace(problem, mesh_change=problem.estimates - coarse)
     return Identification(
         estimates=estimates_of(problem, priors),
         sentences=[*identifiability(problem), *notes, *running.failures()],
@@ -185,7 +197,7 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         cpu=running.cpu,
         problem=problem,
         observations=observations,
-        forces=forces,
+        forces=fit.forces(problem.at),
     )
 
 
@@ -198,32 +210,10 @@ class _Running:
         names: Sequence[str],
         changes: Mapping[str, Any],
         client: Any,
-        refined: Sequence[Path],
-        *,
-        on_refined: bool,
     ) -> None:
         self.computed, self.cpu = 0, 0.0
         self._bags, self._names, self._changes, self._client = bags, names, changes, client
-        self._refined, self._on_refined = refined, on_refined
         self._reasons: dict[str, int] = {}
-
-    def compute(self, wanted: Iterable[tuple[int, Point]]) -> dict[tuple[int, Point], Floats]:
-        """Return computed forces by bag and point, NaN where they cannot be computed."""
-        return self._series(wanted, self._on_refined)
-
-    def on_other_mesh(self, at: Floats) -> tuple[list[Floats], str]:
-        """Return the forces of all bags on the mesh that is not searched on, refined or as
-        recorded, and why there are none, or ''.
-        """
-        point = tuple(np.exp(at).tolist())
-        found = self._series([(i, point) for i in range(len(self._bags))], not self._on_refined)
-        forces = [found[number, point] for number in range(len(self._bags))]
-        if any(np.isnan(each).any() for each in forces):
-            return [], (
-                'on the other mesh some bags could not be computed: intervals are without the '
-                'error of the mesh'
-            )
-        return forces, ''
 
     def failures(self) -> list[str]:
         """Return the reasons of re-simulations that failed."""
@@ -232,20 +222,23 @@ class _Running:
             for reason, count in self._reasons.items()
         ]
 
-    def _changed(self, bag: int, point: Point, refined: bool) -> dict[str, Any]:
-        pairs = zip(self._names, point, strict=True)
-        mesh = {_MESH_KEY: str(self._refined[bag])} if refined else {}
-        return {**self._changes, **{f'{_KEY}.{name}': value for name, value in pairs}, **mesh}
-
-    def _series(
-        self, wanted: Iterable[tuple[int, Point]], refined: bool
+    def compute(
+        self, wanted: Iterable[tuple[int, Point]], meshes: Sequence[str] = ()
     ) -> dict[tuple[int, Point], Floats]:
+        """Return computed forces by bag and point, NaN where they cannot be computed.
+
+        Args:
+            wanted: bags and points.
+            meshes: file of each bag; (): those of the scenes.
+        """
         from cutting_trainer.studies.cluster import compute
 
         here, keys, jobs = identity_of_worker(), {}, []
         for number, key in enumerate(wanted, 1):
-            bag = self._bags[key[0]]
-            setting = Setting(number, self._changed(*key, refined))
+            bag, pairs = self._bags[key[0]], zip(self._names, key[1], strict=True)
+            mesh = {_MESH_KEY: meshes[key[0]]} if meshes else {}
+            material = {f'{_KEY}.{name}': value for name, value in pairs}
+            setting = Setting(number, {**self._changes, **material, **mesh})
             keys[bag.hash, setting.identity] = key
             jobs.append(Job(str(bag.path), bag.hash, setting, here, series=True))
         found = {}
@@ -273,11 +266,10 @@ def _observe(bag: StudyBag) -> Observation:
     return Observation((felt.times - felt.times[0]) * 1e-9, felt.vectors)
 
 
-def _material(bag: StudyBag, changes: Mapping[str, str]) -> MaterialSettings:
+def _tissue(bag: StudyBag, changes: Mapping[str, str]) -> TissueSettings:
     recording = read_recording(str(bag.path), bag.hash)
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
-        scene = load_scene(str(restore_scene(recording.bag, Path(temporary), changes)))
-        return scene.tissue.material
+        return load_scene(str(restore_scene(recording.bag, Path(temporary), changes))).tissue
 
 
 def _workers(options: IdentifyOptions) -> AbstractContextManager[Any]:

@@ -5,7 +5,8 @@
 A trial draws a material and ten hands: palpations and cuts from the sample bags, moved, pressed
 deeper or less deep, with tremor. The forces come from another mesh of half the spacing, whose
 diagonals run the other way and whose inner nodes are displaced, and have the noise of a sensor.
-Further draws of noise reuse the Jacobians of their trial.
+Both meshes have the default model: the `linear` one of the samples locks, so that its force depends
+on the mesh. Further draws of noise reuse the Jacobians of their trial.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from distributed import Client
 from numpy.typing import NDArray
 
 from bench.common.meshes import kuhn_block
@@ -39,22 +41,25 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.studies.bag_collection import find_bags
 from cutting_trainer.studies.cluster import own_cluster
 from cutting_trainer.studies.evaluation import warm_up
-from cutting_trainer.studies.fit import Observation
-from cutting_trainer.studies.identification import Linearised, deviations, window_means
+from cutting_trainer.studies.identification import Linearised, window_means
 from cutting_trainer.studies.identify_command import Identification, IdentifyOptions, identify
 
 Floats = NDArray[np.float64]
 
 SAMPLES = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7'
 SIZE = (0.04, 0.03, 0.01)
-CELLS = (8, 6, 2)
+CELLS = (12, 9, 3)
 """Bricks of the mesh that identifies; the one that emulates has twice as many along each axis."""
+SCENE = {'tissue.model': 'stiffening', 'tissue.integrator': 'symplectic_euler',
+         'tissue.cut_threshold': '0.05'}  # fmt: skip
+"""Changes of the sample's scene. At its own threshold the blade does not enter soft tissue."""
 NOISE = 0.003
 """Noise of one component of the force, rms [N], as of a small six-axis sensor."""
 TREMOR = 5e-5
 """Amplitude of each of the sines between 8 and 12 Hz that make the tremor [m]."""
-RANGES = {'youngs_modulus': (3000.0, 12000.0), 'toughness': (4.0, 12.0),
+RANGES = {'youngs_modulus': (3000.0, 12000.0), 'toughness': (5e-4, 1.1e-3),
           'blade_friction': (1.0, 4.0)}  # fmt: skip
+"""Toughness is drawn over Young's modulus [m]: at a larger length hands 8 mm deep do not cut."""
 HANDS = ('palpation',) * 4 + ('straight_cut',) * 6
 MOVED = 0.004
 """Largest displacement of a hand along x and y; along z it is a fifth of it [m]."""
@@ -92,8 +97,8 @@ def emulate(
     target: Path,
     mesh: Path,
     truth: dict[str, float],
-    random: np.random.Generator,
-    moved: float = MOVED,
+    seed: tuple[int, ...],
+    moved: float,
 ) -> None:
     """Write a bag in which a moved hand feels a known material.
 
@@ -102,15 +107,15 @@ def emulate(
         target: new bag.
         mesh: that emulates.
         truth: constants of the material.
-        random: for hand and noise.
+        seed: of hand and noise.
         moved: largest displacement of the hand [m].
     """
-    bag = open_bag(sample)
+    bag, random = open_bag(sample), np.random.default_rng(seed)
     move = _hand(random, moved)
     records, poses = computable_poses(bag)
     changes = {f'tissue.material.{name}': str(value) for name, value in truth.items()}
     with tempfile.TemporaryDirectory() as folder:
-        changed = {**changes, 'tissue.mesh': str(mesh)}
+        changed = {**changes, **SCENE, 'tissue.mesh': str(mesh)}
         scene = load_scene(str(restore_scene(bag, Path(folder), changed)))
         computed = recomputation(scene, find_beginning(bag), changed=True)
         turned = [_moved(pose, move) for pose in poses]
@@ -169,21 +174,18 @@ def further_draws(
     """
     for _ in range(draws):
         residuals = []
-        for bag, observed in zip(found.problem.residuals, found.observations, strict=True):
-            other = _weighted(observed, NOISE * random.standard_normal(observed.felt.shape))
-            residuals.append(bag + other)
+        for bag, observed, deviations in zip(
+            found.problem.residuals, found.observations, found.problem.deviations, strict=True
+        ):
+            noise = NOISE * random.standard_normal(observed.felt.shape)
+            residuals.append(bag + (window_means(observed.times, noise) / deviations).ravel())
         yield replace(found.problem, residuals=residuals)
-
-
-def _weighted(observed: Observation, noise: Floats) -> Floats:
-    means = window_means(observed.times, noise)
-    return np.asarray((means / deviations(observed.times, observed.felt, NOISE)).ravel())
 
 
 def trial(
     seed: int,
     folder: Path,
-    client: object,
+    client: Client,
     hands: tuple[str, ...] = HANDS,
     *,
     refine: bool = False,
@@ -194,12 +196,17 @@ def trial(
         name: float(np.exp(random.uniform(np.log(low), np.log(high))))
         for name, (low, high) in RANGES.items()
     }
+    truth['toughness'] *= truth['youngs_modulus']
     fine = block(folder / 'fine.vtk', 2, random)
     coarse = block(folder / 'coarse.vtk', 1, None)
     moved = MOVED if len(hands) > 2 else 0.0
-    for number, hand in enumerate(hands):
-        emulate(SAMPLES / hand, folder / f'bag_{number}', fine, truth, random, moved)
-    changes = {'tissue.mesh': str(coarse)}
+    client.gather([
+        client.submit(
+            emulate, SAMPLES / hand, folder / f'bag_{number}', fine, truth, (seed, number), moved
+        )
+        for number, hand in enumerate(hands)
+    ])  # fmt: skip
+    changes = {**SCENE, 'tissue.mesh': str(coarse)}
     options = IdentifyOptions((str(folder),), folder, tuple(RANGES), NOISE, changes, refine)
     return truth, identify(find_bags(options.bags, folder), options, client)
 
