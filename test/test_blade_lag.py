@@ -1,5 +1,7 @@
 """The edge in the tissue stays with the device's, and lets go of tissue that it has left."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from meshes import irregular_box
@@ -89,3 +91,29 @@ def test_turning_the_blade_in_tissue_costs_toughness_times_the_swept_area() -> N
     work, paid = turn(250.0)
     assert paid > 1e-3
     assert work == pytest.approx(paid, rel=0.08)
+
+
+def test_a_blade_in_fine_soft_tissue_is_felt_by_toughness_and_friction_without_chatter() -> None:
+    toughness, friction, depth = 2.7, 2.3, 0.0055
+    nodes, tets = irregular_box((15, 9, 6), 0.0017, 3, jitter=0.1)
+    bottom = nodes[:, 2] < 1e-9
+    nodes[:, 2] += TOP - nodes[:, 2].max()
+    simulation = TissueSimulation(
+        TetMesh(nodes, tets, bottom),
+        Material(3600.0, 0.45, 1000.0, 15.0, 2e-4),
+        Resistance(0.01, toughness, friction),
+        model='stiffening',
+        stepping=TimeStepping(rate=20.0, max_substeps=1000),
+    )
+    cutter = Tissue(simulation, make_method(CuttingSettings()))
+    above = np.array([0.004, 0.0075, TOP + 0.001])
+    deep = above - [0.0, 0.0, 0.001 + depth]
+    stops = [above, deep - [0.0, 0.0, 0.003], deep, deep + np.array([0.015, 0.0, 0.0])]
+    forces = []
+    for tip in np.concatenate([np.linspace(*stops[i : i + 2], 20) for i in range(3)]):
+        frame = cutter.frame(replace(contact_at(simulation, tip), stiffness=200.0))
+        if tip[0] > 0.01:
+            forces.append(-frame.force[0])
+    wanted = depth * (toughness + friction)
+    assert np.mean(forces) == pytest.approx(wanted, rel=0.1)
+    assert np.std(forces) < 0.1 * wanted

@@ -138,15 +138,15 @@ def test_an_edge_that_leaves_just_after_a_cut_does_not_ask_for_nodes_of_the_old_
 
     before, after = box(4), box(2)
     tip = np.array([0.01, 0.01, 0.012])
-    edge = np.array([tip + [0.0, 0.0, 0.012], tip])
+    edge = np.array([[0.01, 0.01, 0.024], tip])
     blade = Blade(Resistance(0.05, TOUGHNESS, 0.0), *edge, hint=0)
     still = np.zeros((2, 3))
     for mesh, height in ((before, 0.0), (after, 0.02)):
         blade.untie()  # the mesh is a new one
         near, opened = NearElements(mesh.tetrahedra), mesh.triangles[:0]
-        device = edge + [0.0, 0.0, height]
+        device = edge + np.array([0.0, 0.0, height])
         blade.follow(mesh, near, opened, mesh.rest, device, still, 80.0, np.zeros(3))
     assert blade.immersed == 0.0
     kept = blade.kept()
-    blade.carry(after.rest + [0.001, 0.0, 0.0])
+    blade.carry(after.rest + np.array([0.001, 0.0, 0.0]))
     assert np.array_equal(blade.kept()['_tip'], kept['_tip'])

@@ -112,7 +112,8 @@ def test_a_session_with_concessions_is_computed_again_identically(
     forgotten = [replace(record, concession=0) for record in records]
     place = ForceSampleCodec.fields['force']
     differing = 0
-    for record, frame in zip(forgotten, as_recorded(forgotten, recomputation(scene)), strict=True):
+    frames = as_recorded(forgotten, recomputation(scene))
+    for record, frame in zip(forgotten[:60], frames, strict=False):  # before the blade enters
         assert record.force is not None
         differing += bool((frame.force != record.force.values[place]).any())
     assert differing, 'a concession that is not followed is seen'

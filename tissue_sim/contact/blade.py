@@ -21,7 +21,7 @@ from cutting_trainer.tissue_sim.contact.blade_law import (
     gather_loads,
     no_pull,
 )
-from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
+from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling, PointSprings
 from cutting_trainer.tissue_sim.contact.facing import BLADE_HEIGHT, Law
 from cutting_trainer.tissue_sim.contact.fracture import BLADE_THICKNESS, Strips
 from cutting_trainer.tissue_sim.contact.immersion import POINTS, SHARES, Edge, Tissue
@@ -32,8 +32,6 @@ _MIN_AREA = 1e-8
 _MIN_WAY = 1e-12
 _MEDIAN_SAMPLES = 20000
 """Elements in the sample for a median."""
-_ONE_WAY = 0.3
-"""Share of the springs' forces in their sum from which on the tissue is loaded point by point."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +110,8 @@ class Blade:
         rubbed: work of friction since entry [J].
     """
 
+    _renumbered = False  # a state of before may lack it
+
     def __init__(
         self,
         resistance: Resistance,
@@ -150,7 +150,7 @@ class Blade:
         self._back: np.ndarray | None = None
         self._from: Anchor | None = None
         self._to: Anchor | None = None
-        self._failed = self._set_back = self._renumbered = False
+        self._failed = self._set_back = False
         self.paid = self.rubbed = self._swept = 0.0
         self._settle(no_pull())
 
@@ -323,11 +323,7 @@ class Blade:
         inside = spans > 0.0
         if not inside.any():
             return Coupling()
-        forces = spans * (self._stretch() @ self.force)
-        loads = spans / spans.sum()
-        if self.force @ self.force > 0.0 and forces.sum() > _ONE_WAY * np.abs(forces).sum():
-            loads = forces / forces.sum()
-        nodes, weights = gather_loads(self._state, loads)
+        nodes, weights = gather_loads(self._state, spans / spans.sum())
         middle = float(SHARES[inside].mean())
         moved = (1 - middle) * (ahead[1] - self._device[1]) + middle * (ahead[0] - self._device[0])
         rate = moved / (1 - share) if share < 1 else np.zeros(3)
@@ -341,7 +337,27 @@ class Blade:
             end=at + moved,
             stiffness=whole,
             limit=self.limit,
+            points=self._springs(inside, positions, ahead, share, stiffness),
         )
+
+    def _springs(
+        self,
+        inside: np.ndarray,
+        positions: np.ndarray,
+        ahead: np.ndarray,
+        share: float,
+        stiffness: float,
+    ) -> PointSprings:
+        """Return the springs of the points in the tissue; arguments as of `spring`."""
+        corners, weights = self._state.corners[inside], self._state.weights[inside]
+        forces, spans = self._forces[inside], self._state.spans[inside]
+        moved = (points_of(ahead) - points_of(self._device))[inside]
+        rates = moved / (1 - share) if share < 1 else np.zeros_like(moved)
+        each = stiffness * spans / WHOLE
+        at = np.einsum('pk,pkc->pc', weights, positions[corners]) + forces / each[:, None]
+        limits = np.maximum(self._limits[inside], np.linalg.norm(forces, axis=1))
+        ends = np.stack([at - share * rates, at + moved], axis=1)
+        return PointSprings(corners, weights, ends, each, limits)
 
     def _stretch(self) -> np.ndarray:
         """Return from the edge to the device's edge at all points [m], shape (POINTS, 3)."""
@@ -354,6 +370,7 @@ class Blade:
             self._tip = tip - pull.line[0]
             self._edge = root - tip - pull.line[1]
         self.force = pull.force
+        self._forces, self._limits = pull.forces, pull.limits
         spans = self._state.spans
         shares = spans / spans.sum() if spans.any() else spans
         immersed = np.array([shares @ SHARES, shares @ SHARES**2])

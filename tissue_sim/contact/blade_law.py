@@ -68,6 +68,8 @@ class Pull(NamedTuple):
         paid, rubbed: work of cutting and of friction [J].
         swept: area of uncut tissue that the edge has gone through [m^2].
         held: whether spine or flat carry tissue along anywhere.
+        forces: of each point on the tissue [N], shape (POINTS, 3).
+        limits: largest force of each point, in the same way as `limit` [N], shape (POINTS,).
     """
 
     force: np.ndarray
@@ -80,12 +82,16 @@ class Pull(NamedTuple):
     rubbed: float
     swept: float
     held: bool
+    forces: np.ndarray
+    limits: np.ndarray
 
 
 @inner
 def no_pull():
     """Return the `Pull` of an edge in the air."""
-    return Pull(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros((2, 3)), 0.0, 0.0, 0.0, 0.0, False)
+    line, forces, limits = np.zeros((2, 3)), np.zeros((POINTS, 3)), np.zeros(POINTS)
+    force, torque = np.zeros(3), np.zeros(3)
+    return Pull(force, torque, 0.0, 0.0, line, 0.0, 0.0, 0.0, 0.0, False, forces, limits)
 
 
 @kernel
@@ -138,23 +144,29 @@ def follow_device(edge, strips, device, moved, tissue, law):
     half = next_tooth(edge, ways, fresh, limits, piece, law).half
     held = hold(edge, ways, blade, law, limits)
     limit, torque_limit = limits.sum() + half, (limits * arms).sum() + half * middle
+    most = limits.copy()
     # As it is pulled now, or will be if the device moves on.
     _resist(edge, moved.copy(), faces, blade, law, fresh, limits)
     half = next_tooth(edge, moved, fresh, limits, piece, law).half
     hold(edge, ways, blade, law, limits)
     limit = max(limit, limits.sum() + half)
     torque_limit = max(torque_limit, (limits * arms).sum() + half * middle)
-    force, torque = np.zeros(3), np.zeros(3)
+    most = np.maximum(most, limits)
+    most *= limit / max(most.sum(), TINY)
+    force, torque, forces = np.zeros(3), np.zeros(3), np.zeros((POINTS, 3))
     for i in range(POINTS):
         pull = law.stiffness * edge.spans[i] * ways[i]
         back = dot(ways[i], facing)
         if back < 0.0:
             pull += edge.spans[i] * settled(-back, piece, law) * facing
         force += pull
+        forces[i] = pull
         torque += np.cross(arms[i] * direction, pull)
     line, mean = _line(edge.spans, ways)
     lag = np.sqrt((mean**2).sum())
-    return Pull(force, torque, limit, torque_limit, line, lag, paid, rubbed, swept, held)
+    return Pull(
+        force, torque, limit, torque_limit, line, lag, paid, rubbed, swept, held, forces, most
+    )
 
 
 @kernel

@@ -44,6 +44,24 @@ class Springs(NamedTuple):
     scalars: np.ndarray
 
 
+class PointSprings(NamedTuple):
+    """The springs of a blade, one for each point of its edge in the tissue, p of them.
+
+    Attributes:
+        nodes: corners of the element around each, shape (p, 4).
+        weights: barycentric coordinates there, shape (p, 4).
+        ends: where the tool's end is at the start and at the end of the frame [m], shape (p, 2, 3).
+        stiffness: [N/m], shape (p,).
+        limits: largest forces [N], shape (p,).
+    """
+
+    nodes: np.ndarray
+    weights: np.ndarray
+    ends: np.ndarray
+    stiffness: np.ndarray
+    limits: np.ndarray
+
+
 @dataclass
 class Coupling:
     """A spring between the tool and the weighted mean of some nodes.
@@ -65,6 +83,9 @@ class Coupling:
         reach: radius of the disc around the touched point that is under load [m]; 0: a triangle.
         share: largest tangential force, relative to the normal force (PUSH): without friction, of
             the tissue that moves under the tool within a frame; else the coefficient of friction.
+        points: springs that move the tissue in place of this one, which is their mean (HOLD). A
+            single spring would load the points otherwise than they pull, and give energy to the
+            tissue: the blade would stick and slip.
     """
 
     mode: int = FREE
@@ -81,6 +102,7 @@ class Coupling:
     most: float = np.inf
     reach: float = 0.0
     share: float = 1.0
+    points: PointSprings | None = None
 
     @cached_property
     def scalars(self) -> np.ndarray:
@@ -138,23 +160,43 @@ def springs_of(couplings: Sequence[Coupling], rest: np.ndarray) -> Springs:
         couplings: of the tools.
         rest: rest positions [m], shape (n, 3).
     """
-    acting = [coupling for coupling in couplings if coupling.mode != FREE]
-    count = len(acting)
-    width = max((len(coupling.nodes) for coupling in acting), default=0)
-    nodes, weights = np.zeros((count, width), np.int64), np.zeros((count, width))
-    for row, coupling in enumerate(acting):
-        nodes[row] = coupling.nodes[0]
-        nodes[row, : len(coupling.nodes)] = coupling.nodes
-        weights[row, : len(coupling.nodes)] = coupling.weights
-    return Springs(
-        np.array([coupling.mode for coupling in acting], np.int64),
-        nodes,
-        weights,
-        np.array([coupling.normal for coupling in acting]).reshape(count, 3),
-        np.array([(coupling.start, coupling.end) for coupling in acting]).reshape(count, 2, 3),
-        np.array([c.weights @ rest[c.nodes] for c in acting]).reshape(count, 3),
-        np.array([coupling.scalars for coupling in acting]).reshape(count, 9),
+    rows = [_rows(coupling) for coupling in couplings if coupling.mode != FREE]
+    width = max((row.nodes.shape[1] for row in rows), default=0)
+    count = sum(len(row.modes) for row in rows)
+    nodes, weights, at = np.zeros((count, width), np.int64), np.zeros((count, width)), 0
+    for row in rows:
+        here = slice(at, at + len(row.modes))
+        nodes[here] = row.nodes[:, :1]
+        nodes[here, : row.nodes.shape[1]] = row.nodes
+        weights[here, : row.nodes.shape[1]] = row.weights
+        at = here.stop
+    anchors = np.einsum('rc,rci->ri', weights, rest[nodes])
+    if not rows:
+        one, scalars = np.zeros((0, 3)), np.zeros((0, 9))
+        return Springs(
+            np.zeros(0, np.int64), nodes, weights, one, np.zeros((0, 2, 3)), one, scalars
+        )
+    modes, normals, ends, scalars = (
+        np.concatenate([getattr(row, name) for row in rows])
+        for name in ('modes', 'normals', 'ends', 'scalars')
     )
+    return Springs(modes, nodes, weights, normals, ends, anchors, scalars)
+
+
+def _rows(coupling: Coupling) -> Springs:
+    """Return the operand for one coupling, without anchors."""
+    points = coupling.points
+    if points is None:
+        ends = np.array([[coupling.start, coupling.end]])
+        nodes, weights = coupling.nodes[None], coupling.weights[None]
+        scalars = coupling.scalars[None]
+    else:
+        nodes, weights, ends = points.nodes, points.weights, points.ends
+        scalars = np.tile(coupling.scalars, (len(nodes), 1))
+        scalars[:, 0], scalars[:, 1] = points.stiffness, points.limits
+    count = len(nodes)
+    modes, normals = np.full(count, coupling.mode), np.tile(coupling.normal, (count, 1))
+    return Springs(modes, nodes, weights, normals, ends, normals, scalars)
 
 
 NO_SPRINGS = springs_of((), np.zeros((0, 3)))

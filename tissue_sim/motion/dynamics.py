@@ -229,8 +229,12 @@ class Dynamics:
         """Return the largest stable step [s], the stiffness of coupling springs included."""
         square = self.omega**2
         for coupling in couplings:
-            inverse = self.inverse_mass[3 * coupling.nodes]
-            square += coupling.stiffness * float(np.sum(coupling.weights**2 * inverse))
+            light = coupling.weights * self.inverse_mass[3 * coupling.nodes]
+            # Springs of points load each node by its weight alone (Gershgorin).
+            by_node = (
+                light * coupling.weights if coupling.points is None else light.max(initial=0.0)
+            )
+            square += coupling.stiffness * float(np.sum(by_node))
         # Rounded up, so that only few different bounds are computed.
         omega = 1.01 ** np.ceil(np.log(np.sqrt(square)) / np.log(1.01))
         if omega not in self._bounds:
