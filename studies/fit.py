@@ -114,7 +114,6 @@ class Fit:
             prior_mean=self._mean,
             prior_spread=self._spread,
             confidence=confidence,
-            recorded=[self._weighted(bag, o.felt) for bag, o in enumerate(self._observations)],
             deviations=self._deviations,
         )
 

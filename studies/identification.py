@@ -36,6 +36,8 @@ PARAMETERS = {
 """Constants of `tissue.material` that can be identified, and their units."""
 FORCE_SPREAD = 0.05
 """Standard deviation of that share: forces under a tool differ by up to 10 % between meshes."""
+_BY_FORCE = ('youngs_modulus', 'toughness', 'blade_friction')
+"""Constants in proportion to the forces of a path: it scales them all alike, but for inertia."""
 MESH_LEFT, MESH_LEFT_SPREAD = 1.0 / 3.0, 1.0 / 3.0
 """Mean and standard deviation of what a finer mesh would still change, as a share of what the first
 refinement changed: a third where errors are quadratic in the size of elements; linear ones (1) and
@@ -130,7 +132,6 @@ class Linearised:
         jacobians: of the computed values, each shape (m, p).
         prior_mean, prior_spread: shape (p,).
         confidence: of the intervals.
-        recorded: window means of the recorded force over their deviations, each shape (m,).
         deviations: of the window means of each bag [N], each shape (windows, 3), before the common
             scale; () where they are not needed.
         mesh_change: of the unknowns from the recorded mesh to the refined one that this problem is
@@ -144,7 +145,6 @@ class Linearised:
     prior_mean: Floats
     prior_spread: Floats
     confidence: float = 0.95
-    recorded: Sequence[Floats] = ()
     deviations: Sequence[Floats] = ()
     mesh_change: Floats | None = None
 
@@ -185,12 +185,6 @@ class Linearised:
         pull = pull + precision * (self.prior_mean - self.at)
         return np.asarray(np.linalg.solve(matrix + np.diag(precision), pull), float)
 
-    @cached_property
-    def by_force(self) -> Floats:
-        """Change of the unknowns by a relative change of all recorded forces, shape (p,)."""
-        pull = sum(j.T @ f for j, f in zip(self.jacobians, self.recorded, strict=True))
-        return np.asarray(self.covariance @ pull / self.scale, float)
-
     def bootstrap_spread(self, seed: int = 0) -> Floats | None:
         """Return standard deviations over bags drawn with replacement, shape (p,).
 
@@ -218,11 +212,10 @@ class Linearised:
         spread = self.bootstrap_spread()
         if spread is not None:
             widths = np.maximum(widths, spread * student.ppf(tail, len(self.residuals) - 1))
-        common = [FORCE_SPREAD * self.by_force] if self.recorded else []
+        common = FORCE_SPREAD * np.isin(self.names, _BY_FORCE)
         if self.mesh_change is not None:
-            common.append(MESH_LEFT_SPREAD * self.mesh_change)
-        for each in common:
-            widths = np.hypot(widths, each * student.ppf(tail, 1e6))
+            common = np.hypot(common, MESH_LEFT_SPREAD * self.mesh_change)
+        widths = np.hypot(widths, common * student.ppf(tail, 1e6))
         # Bags that say nothing leave the prior, and no more than that.
         return np.asarray(np.minimum(widths, self.prior_spread * student.ppf(tail, 1e6)))
 

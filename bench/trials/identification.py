@@ -50,16 +50,15 @@ SAMPLES = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7'
 SIZE = (0.04, 0.03, 0.01)
 CELLS = (12, 9, 3)
 """Bricks of the mesh that identifies; the one that emulates has twice as many along each axis."""
-SCENE = {'tissue.model': 'stiffening', 'tissue.integrator': 'symplectic_euler',
-         'tissue.cut_threshold': '0.05'}  # fmt: skip
-"""Changes of the sample's scene. At its own threshold the blade does not enter soft tissue."""
+SCENE = {'tissue.model': 'stiffening', 'tissue.integrator': 'symplectic_euler'}
 NOISE = 0.003
 """Noise of one component of the force, rms [N], as of a small six-axis sensor."""
 TREMOR = 5e-5
 """Amplitude of each of the sines between 8 and 12 Hz that make the tremor [m]."""
-RANGES = {'youngs_modulus': (3000.0, 12000.0), 'toughness': (5e-4, 1.1e-3),
+RANGES = {'youngs_modulus': (6000.0, 12000.0), 'toughness': (5e-4, 1.1e-3),
           'blade_friction': (1.0, 4.0)}  # fmt: skip
-"""Toughness is drawn over Young's modulus [m]: at a larger length hands 8 mm deep do not cut."""
+"""Toughness is drawn over Young's modulus [m]. These hands do not enter a softer tissue, and do not
+cut a tougher one."""
 HANDS = ('palpation',) * 4 + ('straight_cut',) * 6
 MOVED = 0.004
 """Largest displacement of a hand along x and y; along z it is a fifth of it [m]."""
