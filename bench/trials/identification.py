@@ -55,7 +55,7 @@ NOISE = 0.003
 """Noise of one component of the force, rms [N], as of a small six-axis sensor."""
 TREMOR = 5e-5
 """Amplitude of each of the sines between 8 and 12 Hz that make the tremor [m]."""
-RANGES = {'youngs_modulus': (6000.0, 12000.0), 'toughness': (5e-4, 1.1e-3),
+RANGES = {'youngs_modulus': (8000.0, 16000.0), 'toughness': (5e-4, 1.1e-3),
           'blade_friction': (1.0, 4.0)}  # fmt: skip
 """Toughness is drawn over Young's modulus [m]. These hands do not enter a softer tissue, and do not
 cut a tougher one."""
