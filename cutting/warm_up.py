@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from cutting_trainer.cutting.lookup import empty_tables, with_room
+from cutting_trainer.cutting.lookup import edge_key, empty_tables, find_edge, with_room
 from cutting_trainer.cutting.method_registry import make_method
 from cutting_trainer.cutting.parting import Surface, part_along
 from cutting_trainer.cutting.scene_schema import CuttingSettings
@@ -26,10 +26,13 @@ def warm_up(settings: CuttingSettings) -> None:
             mesh.apply(result.delta)
     method.finish(mesh, mesh.rest)
     _part(small_cube())
-    # Of elements that are too flat to be divided: the cube has none.
+    # Of elements that are too flat to be divided or would be inside out: the cube has none.
     tables = with_room(empty_tables(), mesh_nodes=1, tetrahedra=1, nodes=1, edges=1, parents=1)
     put_on_cut(tables, 0, np.zeros(0, np.int64), mesh.rest)
     block(tables, 0, np.zeros(0, np.int64))
+    ends = np.int64(0), np.int64(1)
+    find_edge(tables, *ends)
+    edge_key(*ends)
 
 
 def _part(mesh: TetMesh) -> None:
