@@ -263,6 +263,13 @@ def normal_force(stretch, scalars):
     return root * root * root
 
 
+@inner
+def held_by(stretch, stiffness, limit):
+    """Return the force over the stretch of a spring that yields at its limit [N/m]."""
+    length = np.sqrt(stretch[0] ** 2 + stretch[1] ** 2 + stretch[2] ** 2)
+    return limit / length if stiffness * length > limit else stiffness
+
+
 @kernel
 def spring_force(mode, stretch, normal, scalars, out):
     """Compute the force of the spring on the tissue.
@@ -296,30 +303,30 @@ def spring_force(mode, stretch, normal, scalars, out):
         for i in range(3):
             out[i] = stiffness * (along * normal[i] + grip * out[i])
     elif mode == HOLD:
-        length = np.sqrt(stretch[0] ** 2 + stretch[1] ** 2 + stretch[2] ** 2)
-        size = stiffness
-        if stiffness * length > limit:
-            size = limit / length
+        size = held_by(stretch, stiffness, limit)
         for i in range(3):
             out[i] = size * stretch[i]
 
 
 @inner
-def spring_stretch(springs, tool, at, u, stretch):
+def spring_stretch(nodes, weights, ends, anchors, tool, at, u, stretch):
     """Compute the tool's end minus the tissue's end.
 
     Args:
-        springs: see `Springs`.
+        nodes, weights, ends, anchors: see `Springs`.
         tool: which one.
         at: elapsed share of the frame.
         u: displacement by coordinate [m], shape (3 n,).
         stretch: output [m], shape (3,).
     """
-    ends = springs.ends[tool]
     for i in range(3):
-        stretch[i] = ends[0, i] + at * (ends[1, i] - ends[0, i]) - springs.anchors[tool, i]
-        for c in range(springs.nodes.shape[1]):
-            stretch[i] -= springs.weights[tool, c] * u[3 * springs.nodes[tool, c] + i]
+        stretch[i] = ends[tool, 0, i] + at * (ends[tool, 1, i] - ends[tool, 0, i])
+        stretch[i] -= anchors[tool, i]
+        for c in range(nodes.shape[1]):
+            stretch[i] -= weights[tool, c] * u[3 * nodes[tool, c] + i]
+
+
+# The loops take the arrays out of the tuple once: Numba counts references for each that is taken.
 
 
 @inner
@@ -332,11 +339,16 @@ def forces_of_springs(springs, at, u, out):
         u: displacement by coordinate [m], shape (3 n,).
         out: [N], shape (t, 3).
     """
-    stretch = np.empty(3)
-    for tool in range(springs.modes.shape[0]):
-        spring_stretch(springs, tool, at, u, stretch)
-        mode, normal = springs.modes[tool], springs.normals[tool]
-        spring_force(mode, stretch, normal, springs.scalars[tool], out[tool])
+    nodes, weights, ends, anchors = springs.nodes, springs.weights, springs.ends, springs.anchors
+    modes, normals, scalars, stretch = springs.modes, springs.normals, springs.scalars, np.empty(3)
+    for tool in range(modes.shape[0]):
+        spring_stretch(nodes, weights, ends, anchors, tool, at, u, stretch)
+        if modes[tool] == HOLD:
+            size = held_by(stretch, scalars[tool, 0], scalars[tool, 1])
+            for i in range(3):
+                out[tool, i] = size * stretch[i]
+        else:
+            spring_force(modes[tool], stretch, normals[tool], scalars[tool], out[tool])
 
 
 @inner
@@ -348,10 +360,11 @@ def subtract_springs(springs, at, u, f, out):
         springs, at, u, out: as for `forces_of_springs`.
     """
     forces_of_springs(springs, at, u, out)
-    for tool in range(springs.modes.shape[0]):
-        for c in range(springs.nodes.shape[1]):
+    nodes, weights = springs.nodes, springs.weights
+    for tool in range(nodes.shape[0]):
+        for c in range(nodes.shape[1]):
             for i in range(3):
-                f[3 * springs.nodes[tool, c] + i] -= springs.weights[tool, c] * out[tool, i]
+                f[3 * nodes[tool, c] + i] -= weights[tool, c] * out[tool, i]
 
 
 @inner
@@ -365,12 +378,12 @@ def work_of_springs(springs, forces, u, last):
         last: forces [N] and positions [m] of the tissue's ends at the last call; updated, shape
             (t, 2, 3).
     """
-    work = 0.0
-    for tool in range(springs.modes.shape[0]):
+    work, nodes, weights = 0.0, springs.nodes, springs.weights
+    for tool in range(nodes.shape[0]):
         for i in range(3):
             place = 0.0
-            for c in range(springs.nodes.shape[1]):
-                place += springs.weights[tool, c] * u[3 * springs.nodes[tool, c] + i]
+            for c in range(nodes.shape[1]):
+                place += weights[tool, c] * u[3 * nodes[tool, c] + i]
             way = place - last[tool, 1, i]
             work += 0.5 * (forces[tool, i] + last[tool, 0, i]) * way
             last[tool, 0, i] = forces[tool, i]

@@ -155,6 +155,7 @@ def implicit_steps(
     p, q, f, inverse = work[3, :size], work[4, :size], work[5, :size], work[6, :size]
     factors = np.array([1.0 + dt * alpha, dt * dt + dt * beta, dt * dt])
     tools = springs.modes.shape[0]
+    nodes, weights, ends, anchors = springs.nodes, springs.weights, springs.ends, springs.anchors
     stretch, forces, matrices = np.empty(3), np.zeros((tools, 3)), np.zeros((tools, 3, 3))
     last = np.zeros((tools, 2, 3))
     done = start_of_work(springs, u, last)
@@ -176,13 +177,13 @@ def implicit_steps(
                     q[i] = u[i] + dt * x[i]
                 change = 0.0
                 for t in range(tools):
-                    spring_stretch(springs, t, at, q, stretch)
+                    spring_stretch(nodes, weights, ends, anchors, t, at, q, stretch)
                     law = springs.modes[t], springs.normals[t], springs.scalars[t]
                     change = max(change, _secant(*law, stretch, matrices[t]))
                 if attempt > 0 and change < 1e-6:
                     break
                 for t in range(tools):
-                    spring_stretch(springs, t, at, u, stretch)
+                    spring_stretch(nodes, weights, ends, anchors, t, at, u, stretch)
                     for i in range(3):
                         forces[t, i] = 0.0
                         for j in range(3):
