@@ -89,7 +89,6 @@ class Fit:
             begin: logarithms of the constants where the search begins, shape (p,).
             confidence: of the intervals.
         """
-        self._allow_for_jumps(begin)
         # Of the prior only the share counts that the fit of the start leaves to it.
         misfit = np.concatenate(self._residuals(begin))
         self._scale = float(np.sqrt(np.mean(misfit**2))) or 1.0
@@ -140,8 +139,9 @@ class Fit:
         few = np.linspace(0, len(self._observations) - 1, _START_BAGS).astype(int)
         bags = sorted(set(few.tolist()))
         self._need([(bag, self._point(at)) for at in points for bag in bags])
+        # As the search weighs them: a window without recorded force must not decide.
         costs = [
-            sum(float(np.sum(self._residual(bag, at) ** 2)) for bag in bags)
+            sum(2.0 * float(np.sum(np.hypot(1.0, self._residual(bag, at)) - 1.0)) for bag in bags)
             + float(np.sum(((at - self._mean) / self._spread) ** 2))
             for at in points
         ]
