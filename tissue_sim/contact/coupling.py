@@ -161,7 +161,12 @@ def springs_of(couplings: Sequence[Coupling], rest: np.ndarray) -> Springs:
         rest: rest positions [m], shape (n, 3).
     """
     rows = [_rows(coupling) for coupling in couplings if coupling.mode != FREE]
-    width = max((row.nodes.shape[1] for row in rows), default=0)
+    if not rows:
+        none, pairs = np.zeros((0, 3)), np.zeros((0, 2, 3))
+        nodes, weights = np.zeros((0, 0), np.int64), np.zeros((0, 0))
+        modes, scalars = np.zeros(0, np.int64), np.zeros((0, 9))
+        return Springs(modes, nodes, weights, none, pairs, none, scalars)
+    width = max(row.nodes.shape[1] for row in rows)
     count = sum(len(row.modes) for row in rows)
     nodes, weights, at = np.zeros((count, width), np.int64), np.zeros((count, width)), 0
     for row in rows:
@@ -171,11 +176,6 @@ def springs_of(couplings: Sequence[Coupling], rest: np.ndarray) -> Springs:
         weights[here, : row.nodes.shape[1]] = row.weights
         at = here.stop
     anchors = np.einsum('rc,rci->ri', weights, rest[nodes])
-    if not rows:
-        one, scalars = np.zeros((0, 3)), np.zeros((0, 9))
-        return Springs(
-            np.zeros(0, np.int64), nodes, weights, one, np.zeros((0, 2, 3)), one, scalars
-        )
     modes, normals, ends, scalars = (
         np.concatenate([getattr(row, name) for row in rows])
         for name in ('modes', 'normals', 'ends', 'scalars')

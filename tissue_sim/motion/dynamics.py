@@ -230,11 +230,10 @@ class Dynamics:
         square = self.omega**2
         for coupling in couplings:
             light = coupling.weights * self.inverse_mass[3 * coupling.nodes]
-            # Springs of points load each node by its weight alone (Gershgorin).
-            by_node = (
-                light * coupling.weights if coupling.points is None else light.max(initial=0.0)
-            )
-            square += coupling.stiffness * float(np.sum(by_node))
+            load = np.sum(light * coupling.weights)
+            if coupling.points is not None:  # each node by its weight alone (Gershgorin)
+                load = light.max()
+            square += coupling.stiffness * float(load)
         # Rounded up, so that only few different bounds are computed.
         omega = 1.01 ** np.ceil(np.log(np.sqrt(square)) / np.log(1.01))
         if omega not in self._bounds:
