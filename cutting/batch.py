@@ -67,8 +67,8 @@ class Scheme:
         subdivides: elements are divided.
         least_share: smallest distance of new nodes from the ends of an edge, as a share of the
             edge.
-        reach: how much further than the tip the blade is taken to cut, as a share of the median
-            altitude at the start: by so much the front ends short of it in the mean.
+        leads_on: the cut is led on beyond the blade, as the front ends short of it, and strokes are
+            joined.
     """
 
     tau: float = 0.33
@@ -80,7 +80,7 @@ class Scheme:
     slides: bool = True
     subdivides: bool = True
     least_share: float = 0.1
-    reach: float = 0.0
+    leads_on: bool = False
 
 
 class Batch(NamedTuple):

@@ -21,6 +21,15 @@ from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, grown
 
 _ROOM_FOR_CHILDREN = 6.0
+_LEAD = 0.44
+"""How far a cut is led on where a stroke begins or ends inside the tissue, in median altitudes. The
+front ends short of the blade by so much in the mean."""
+_REACH, _SHALLOW = 0.25, 1.0
+"""How much further than its tip a blade is taken to cut that is an edge deep or deeper; and what is
+added for each edge that is lacking to this depth, in median altitudes. A shallow blade passes
+between the edges of the elements."""
+_MAX_REACH, _REACH_BY_DEPTH = 0.6, 2.0
+"""Largest reach, and largest reach for each edge of depth, in median altitudes."""
 _NEAR = 0.5
 """Distance from the surface at which a node with a contradicted side is put on the cut, as a share
 of the median altitude."""
@@ -63,6 +72,7 @@ class CombinedMethod:
         self._last = np.zeros((4, 3))
         self._direction = np.zeros(3)
         self._active = np.zeros((0, 4), np.int64)
+        self._reach = 0.0
         self._located = False
         self._seen = np.zeros(0, np.int64)
         self._mark = 0
@@ -96,6 +106,7 @@ class CombinedMethod:
         self._last = np.zeros((4, 3))
         self._direction = np.zeros(3)
         self._active = np.zeros((0, 4), np.int64)
+        self._reach = 0.0
         self._located = False
 
     def _work(self, mesh: TetMesh, positions: np.ndarray, *, finish: bool) -> CutResult:
@@ -162,7 +173,7 @@ class CombinedMethod:
         """
         h = _EDGE * self._altitude
         lines, self._lines = self._lines, self._lines[:0]
-        if not self._scheme.reach or len(lines) < 2:
+        if not self._scheme.leads_on or len(lines) < 2:
             return delta, 0.0, []
         delta, area, places = part_bridges(mesh, delta, self._tables, self._first_new, lines, h)
         ends = []
@@ -182,13 +193,13 @@ class CombinedMethod:
         return delta, area + more, said
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
-        """Lead the cut on by the reach, where a stroke ends inside the tissue."""
-        reach = self._scheme.reach * self._altitude
+        """Lead the cut on where a stroke ends inside the tissue."""
+        lead = _LEAD * self._altitude if self._scheme.leads_on else 0.0
         way = (self._last[2:] - self._last[1::-1]).mean(axis=0)
         length = float(np.linalg.norm(way))
-        if len(self._active) and min(reach, length) > 0.0:
+        if len(self._active) and min(lead, length) > 0.0:
             end = self._last[[3, 2, 2, 3]]
-            end[2:] += way * (reach / length)
+            end[2:] += way * (lead / length)
             self._meet(mesh, positions, end, tolerant=True)
         self._last = np.zeros((4, 3))
 
@@ -225,19 +236,16 @@ class CombinedMethod:
         links, tables = mesh.links, self._tables
         self._mark += 1
         self._seen = grown(self._seen, len(tables.owner))
-        # The mesh cuts short of the blade's ends by this much, in the mean.
-        reach = self._scheme.reach * self._altitude
-        triangles = surfaces(lengthened(corners, reach, reach, back=0.0))
+        most = _MAX_REACH * self._altitude if self._scheme.leads_on else 0.0
+        triangles = surfaces(lengthened(corners, most, most, back=0.0))
         met = met_tetrahedra(
             triangles, links, positions, near, not self._located, self._seen, self._mark
         )
         self._located |= len(met) > 0
-        active = active_list(corners[3], corners[2], links, tables, positions, met)
-        begins = not tables.counts[NODES]
-        if begins or not (len(self._active) and len(active)):
-            before, after = reach * (len(self._active) > 0), reach * (len(active) > 0)
-            back = before if begins else 0.0
-            triangles = surfaces(lengthened(corners, before, after, back=back))
+        active, depth = active_list(corners[3], corners[2], links, tables, positions, met)
+        before, after = self._reach, self._reach_at(depth)
+        back = 0.0 if tables.counts[NODES] or before == 0.0 else _LEAD * self._altitude
+        triangles = surfaces(lengthened(corners, before, after, back=back))
         nodes, data = find_hits(triangles, links, tables, positions, met)
         self._turn(triangles, corners)
         stroke = self._stroke(mesh, positions)
@@ -255,8 +263,20 @@ class CombinedMethod:
         if not self._scheme.subdivides:
             give_up_edges(tables)
         self._tables = tables
-        self._active = active
+        self._active, self._reach = active, after
         return len(met), False
+
+    def _reach_at(self, depth: float) -> float:
+        """Return how much further than its tip a blade at a depth is taken to cut [m].
+
+        Args:
+            depth: length of the edge in the tissue [m].
+        """
+        if not self._scheme.leads_on:
+            return 0.0
+        deep = depth / (_EDGE * self._altitude)
+        reach = _REACH + _SHALLOW * max(1.0 - deep, 0.0)
+        return min(reach, _MAX_REACH, _REACH_BY_DEPTH * deep) * self._altitude
 
     def _stroke(self, mesh: TetMesh, positions: np.ndarray) -> SnapStroke:
         """Return the operand of the kernels of snapping."""

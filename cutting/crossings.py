@@ -310,8 +310,10 @@ def _crossing(triangle, n, extent, positions, a, b, near, x):
 
 
 @inner
-def segment_meets(p, q, positions, corners):
-    """Return whether the segment p q meets a tetrahedron.
+def segment_within(p, q, positions, corners):
+    """Return the ends of the part of the segment p q in a tetrahedron, as shares of it.
+
+    The first is larger than the last if none of it is.
 
     Args:
         p, q: ends [m], shape (3,).
@@ -326,9 +328,9 @@ def segment_meets(p, q, positions, corners):
         # Outside where the volume with the outward face is positive; clip the segment.
         s, e = orientation(a, b, c, p), orientation(a, b, c, q)
         if s > 0.0 and e > 0.0:
-            return False
+            return 1.0, 0.0
         if s > 0.0:
             low = max(low, s / (s - e))
         elif e > 0.0:
             high = min(high, s / (s - e))
-    return low <= high
+    return low, high

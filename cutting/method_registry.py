@@ -6,17 +6,13 @@ from cutting_trainer.cutting.delete import DeleteMethod
 from cutting_trainer.cutting.method_interface import CutMethod
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 
-_REACH = 0.44
-"""Of `combined`: without it, straight cuts through well-shaped elements lack 0.3 edges of depth, at
-any depth."""
-
 
 def make_method(settings: CuttingSettings) -> CutMethod:
     """Return the method of some settings."""
     floor = settings.altitude_floor
     match settings.method:
         case 'combined':
-            return CombinedMethod(Scheme(tau=settings.tau or 0.33, floor=floor, reach=_REACH))
+            return CombinedMethod(Scheme(tau=settings.tau or 0.33, floor=floor, leads_on=True))
         case 'combined_midpoint':
             tau = settings.tau or 0.25
             return CombinedMethod(Scheme(tau=tau, floor=floor, true_points=False, slides=False))

@@ -4,7 +4,7 @@ tetrahedra.
 
 import numpy as np
 
-from cutting_trainer.cutting.crossings import segment_meets
+from cutting_trainer.cutting.crossings import segment_within
 from cutting_trainer.cutting.geometry import EDGE_NODES
 from cutting_trainer.cutting.lookup import (
     BLOCKED,
@@ -27,7 +27,7 @@ from cutting_trainer.tissue_sim.mesh.topology import OUTER
 
 @kernel
 def active_list(root, tip, links, tables, positions, met):
-    """Return the stroke's original tetrahedra around the blade, by their nodes (thesis 5.4).
+    """Return the stroke's original tetrahedra around the blade (thesis 5.4).
 
     Args:
         root, tip: the blade's edge [m], shape (3,).
@@ -36,8 +36,9 @@ def active_list(root, tip, links, tables, positions, met):
         met: tetrahedra met by the sweep, shape (t,).
 
     Returns:
-        Shape (a, 4).
+        Their nodes, shape (a, 4), and the length of the edge in them [m].
     """
+    inside = 0.0
     active = np.empty((len(met), 4), np.int64)
     count = 0
     seen = {np.int64(-1)}
@@ -48,9 +49,11 @@ def active_list(root, tip, links, tables, positions, met):
                 continue
             seen.add(owner)
         base_nodes(tables, links, tet, active[count])
-        if segment_meets(root, tip, positions, active[count]):
+        low, high = segment_within(root, tip, positions, active[count])
+        if low <= high:
+            inside += high - low
             count += 1
-    return active[:count]
+    return active[:count], inside * np.sqrt(((tip - root) ** 2).sum())
 
 
 @kernel
