@@ -188,6 +188,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer export bags/sessions/study bags/sessions/study.h5 --format hdf5 --licence '
     'CC-BY-4.0': Nowhere('needs ten bags: test_session_arrays.py exports others'),
     'python -m bench.trials.identification': Nowhere('takes an hour'),
+    'python -m bench.trials.study': Nowhere('takes ten minutes, and needs the machine for itself'),
     **{
         f'./trainer run python -m bench.files.lerobot_loader{more}': Nowhere('it downloads 4 GB')
         for more in ('', ' --episodes 3 --video')

@@ -1,8 +1,6 @@
 """Figures of studies: workers side by side, and tables after kills and from others' workers."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -13,14 +11,13 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from bench.common.processes import children_of
 from bench.figures.figure import Figure
+from bench.trials.study import STUDY, computed_twice, kill
 from cutting_trainer.studies.bag_collection import find_bags
 from cutting_trainer.studies.cluster import compute, own_cluster
 from cutting_trainer.studies.designs import Setting
 from cutting_trainer.studies.evaluation import Job, evaluate
 from cutting_trainer.studies.identity import identity_of_worker
-from cutting_trainer.studies.journal import JOURNAL_FILE
 from cutting_trainer.studies.table import TABLE_FILE
 
 SAMPLES = Path(__file__).parents[2] / 'bags' / 'samples' / 'format_7'
@@ -80,56 +77,25 @@ def _tables(folder: Path) -> list[Figure]:
     )
     killed, others = folder / 'killed', folder / 'others'
     with _scheduler(folder) as address:  # it starts while others are killed
-        _kill(study, killed)
-        commands = [[*_STUDY, str(study), '-o', str(to), '--scheduler', address]
+        kill(study, killed, KILLED_WORKERS, 1)
+        commands = [[*STUDY, str(study), '-o', str(to), '--scheduler', address]
                     for to in (others, killed)]  # fmt: skip
         quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
         for running in [subprocess.Popen(command, **quiet) for command in commands]:
             if status := running.wait(_TIMEOUT_S):
                 raise RuntimeError(f'a study ended with status {status}')
-    keys = [json.loads(line)['key'] for line in (killed / JOURNAL_FILE).read_text().splitlines()]
     table = pq.read_table(killed / TABLE_FILE)
     same = (killed / TABLE_FILE).read_bytes() == (others / TABLE_FILE).read_bytes()
     computed = sum(not reason for reason in table.column('failure').to_pylist())
-    repeated = len(keys) - len({tuple(key) for key in keys})
     return [
         Figure(1, 'rows after workers and then the study were killed (-9)', computed, ROWS,
                'at least', '', ROWS),
-        Figure(1, 'of these, rows computed twice', repeated, 0, 'at most', '', ROWS),
+        Figure(1, 'of these, rows computed twice', computed_twice(killed), 0, 'at most', '', ROWS),
         Figure(1, 'tables that differ by a bit after these kills', float(not same), 0, 'at most',
                '', KILLED_WORKERS + 1),
         Figure(2, 'tables of a scheduler and two workers of others that differ by a bit',
                float(not same), 0, 'at most', '', 1),
     ]  # fmt: skip
-
-
-_STUDY = (*_COMMAND, 'cutting_trainer.cli', 'study')
-
-
-def _kill(study: Path, output: Path) -> None:
-    """Start a study, kill its workers one after the other, and in the end itself."""
-    command = [*_STUDY, str(study), '-o', str(output), '--workers', '2']
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
-        for number in range(KILLED_WORKERS + 1):
-            while _lines(output) <= number:
-                if running.poll() is not None:
-                    raise RuntimeError(f'the study ended with status {running.returncode}')
-                time.sleep(0.02)
-            while number < KILLED_WORKERS and not (workers := _workers_of(running.pid)):
-                time.sleep(0.02)
-            victim = workers[0] if number < KILLED_WORKERS else running.pid
-            os.kill(victim, signal.SIGKILL)
-
-
-def _lines(output: Path) -> int:
-    file = output / JOURNAL_FILE
-    return file.read_bytes().count(b'\n') if file.exists() else 0
-
-
-def _workers_of(process: int) -> list[int]:
-    """Return the processes that compute for a study."""
-    named = {pid: Path(f'/proc/{pid}/cmdline').read_bytes() for pid in children_of(process)}
-    return [pid for pid, words in named.items() if b'multiprocessing.spawn' in words]
 
 
 @contextmanager
