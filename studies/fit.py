@@ -24,6 +24,8 @@ smaller step divides its jumps by less."""
 START_POINTS = 3
 """Points of the start's design for each unknown."""
 MAX_STEPS = 8
+MAX_SEARCHES = 4
+"""Times that the search begins anew where an end of its differences fits better."""
 _START_BAGS = 3
 _START_SPREAD = 1.5
 """Half of the design's range, and _BOUND that of the search, in spreads of the prior."""
@@ -93,28 +95,49 @@ class Fit:
         misfit = np.concatenate(self._residuals(begin))
         self._scale = float(np.sqrt(np.mean(misfit**2))) or 1.0
         bound = _BOUND * self._spread
-        found = least_squares(
-            self._objective,
-            begin,
-            jac=self._slope,
-            bounds=(np.minimum(self._mean, begin) - bound, np.maximum(self._mean, begin) + bound),
-            x_scale=self._spread,
-            loss='soft_l1',
-            xtol=_TOLERANCE,
-            ftol=_TOLERANCE,
-            max_nfev=MAX_STEPS,
-        )
-        self._allow_for_jumps(found.x)
+        low, high = np.minimum(self._mean, begin) - bound, np.maximum(self._mean, begin) + bound
+        at = begin
+        for _ in range(MAX_SEARCHES):
+            at = least_squares(
+                self._objective,
+                at,
+                jac=self._slope,
+                bounds=(low, high),
+                x_scale=self._spread,
+                loss='soft_l1',
+                xtol=_TOLERANCE,
+                ftol=_TOLERANCE,
+                max_nfev=MAX_STEPS,
+            ).x
+            better = self._better_end(at, low, high)
+            if better is None:
+                break
+            at = better
+        self._allow_for_jumps(at)
         return Linearised(
             names=tuple(self._priors),
-            at=found.x,
-            residuals=self._residuals(found.x),
-            jacobians=self._jacobians(found.x),
+            at=at,
+            residuals=self._residuals(at),
+            jacobians=self._jacobians(at),
             prior_mean=self._mean,
             prior_spread=self._spread,
             confidence=confidence,
             deviations=self._deviations,
         )
+
+    def _better_end(self, at: Floats, low: Floats, high: Floats) -> Floats | None:
+        """Return the best end of the central differences that fits better than a point, or None.
+
+        Jumps of a cut stop a search where a step away the fit is better.
+
+        Args:
+            at: logarithms of the constants, and
+            low, high: their bounds, each shape (p,).
+        """
+        ends = [np.log(end) for pair in self._ends(at) for end in pair]
+        within = [end for end in ends if (low <= end).all() and (end <= high).all()]
+        best = min([at, *within], key=lambda end: _loss(self._objective(end)))
+        return None if best is at else np.asarray(best)
 
     def forces(self, at: Floats) -> list[Floats]:
         """Return the computed forces of all bags [N], each of shape (n, 3)."""
@@ -141,7 +164,7 @@ class Fit:
         self._need([(bag, self._point(at)) for at in points for bag in bags])
         # As the search weighs them: a window without recorded force must not decide.
         costs = [
-            sum(2.0 * float(np.sum(np.hypot(1.0, self._residual(bag, at)) - 1.0)) for bag in bags)
+            sum(_loss(self._residual(bag, at)) for bag in bags)
             + float(np.sum(((at - self._mean) / self._spread) ** 2))
             for at in points
         ]
@@ -226,3 +249,8 @@ class Fit:
         missing = [each for each in dict.fromkeys(wanted) if each not in self._known]
         if missing:
             self._known |= self._compute(missing)
+
+
+def _loss(residuals: Floats) -> float:
+    """Return the loss `soft_l1` of residuals."""
+    return 2.0 * float(np.sum(np.hypot(1.0, residuals) - 1.0))

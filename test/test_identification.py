@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.studies import identification
+from cutting_trainer.studies import fit, identification
 from cutting_trainer.studies.fit import Fit, Observation
 from cutting_trainer.studies.identification import (
     Linearised,
@@ -89,6 +90,20 @@ def test_a_point_that_cannot_be_computed_does_not_look_like_a_fit() -> None:
     observed = [Observation(TIMES, law(bag, *TRUTH.values())) for bag in range(3)]
     found = Fit(observed, PRIORS, NOISE, failing).solve(np.log([3000.0, 400.0]), 0.95)
     assert np.exp(found.estimates) == pytest.approx(list(TRUTH.values()), rel=0.02)
+
+
+def test_a_search_that_stops_where_a_step_away_the_fit_is_better_begins_anew(monkeypatch) -> None:
+    begins, search = [], fit.least_squares
+
+    def stops_at_once(objective: Callable, begin: np.ndarray, **options: object) -> object:
+        begins.append(np.exp(begin))
+        return search(objective, begin, **options) if len(begins) > 1 else SimpleNamespace(x=begin)
+
+    monkeypatch.setattr(fit, 'least_squares', stops_at_once)
+    observed = [Observation(TIMES, law(bag, *TRUTH.values())) for bag in range(3)]
+    found = Fit(observed, PRIORS, NOISE, compute).solve(np.log([5000.0, 150.0]), 0.95)
+    assert np.exp(found.estimates) == pytest.approx(list(TRUTH.values()), rel=0.02)
+    assert len(begins) == 2 and begins[1][0] == pytest.approx(5000.0 * np.exp(fit.DIFFERENCE))
 
 
 def problem(columns: list[np.ndarray], names: tuple[str, ...]) -> Linearised:
