@@ -25,7 +25,7 @@ START_POINTS = 3
 """Points of the start's design for each unknown."""
 MAX_STEPS = 8
 MAX_SEARCHES = 4
-"""Times that the search begins anew where an end of its differences fits better."""
+"""Searches, with the first: each other one begins where an end of the differences fits better."""
 _START_BAGS = 3
 _START_SPREAD = 1.5
 """Half of the design's range, and _BOUND that of the search, in spreads of the prior."""
