@@ -2,12 +2,15 @@
 
 An element whose nodes are all on the cut, though not all of them on the swept surface, is given a
 side by itself; the faces between such elements need not close the cut. At the end of a stroke, the
-tissue that still connects its two sides is parted by a least cut.
+tissue that still connects its two sides is parted by a least cut. So is tissue that a blade has
+swept without opening it, where an earlier motion put nodes on the wrong side.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cutting_trainer.cutting.coverage import GAP, uncovered_points
+from cutting_trainer.cutting.front import Opened
 from cutting_trainer.cutting.lookup import MINUS, NODES, PLUS, Tables
 from cutting_trainer.cutting.parting import (
     Floats,
@@ -17,6 +20,7 @@ from cutting_trainer.cutting.parting import (
     judged_heights,
     least_faces,
     local_elements,
+    nearest_points,
     open_faces,
 )
 from cutting_trainer.node_common.kernels import kernel
@@ -30,12 +34,14 @@ _CLEAR = 0.35
 """Height above the surface from which an element is on one side, in edges."""
 _MARGIN = 1.0
 """Width of the strip along a free border of the surface that is not judged, in edges."""
-GAP = 1.0
-"""Way between two remembered places of the blade from which it was outside between, in edges."""
+_AROUND = 1.0
+"""Distance from a place that is not opened up to which the tissue is parted, in edges."""
+_UNCOVERED_MARGIN = 0.5
+"""The margin for places that are not opened, in edges."""
 _SHEET = 0.4
 """Distance from the tangent plane up to which another place is of the same sheet, in edges."""
 _STEP = 0.2
-_TRIES = 2
+_TRIES, _LAYERS = 2, 2
 
 
 def part_bridges(
@@ -56,7 +62,7 @@ def part_bridges(
         The batch with the parting, the further area [m^2], and the places at rest [m], shape
         (j, 3), where tissue could not be parted.
     """
-    surface = _judged_surface(lines, h)
+    surface = _judged_surface(lines, h, _MARGIN * h)
     area, places = 0.0, np.zeros((0, 3))
     if not len(surface.points):
         return delta, area, places
@@ -76,6 +82,41 @@ def part_bridges(
     return delta, area, places
 
 
+def part_uncovered(
+    mesh: TetMesh,
+    delta: TopologyDelta,
+    tables: Tables,
+    opened: Opened,
+    lines: Floats,
+    h: float,
+) -> tuple[TopologyDelta, float]:
+    """Part the tissue where a blade has swept without opening it.
+
+    Elements have the side of the surface on which they lie, whatever the stroke says of their
+    nodes.
+
+    Args:
+        mesh, delta, tables, lines, h: as of `part_bridges`.
+        opened: faces opened around the stroke.
+
+    Returns:
+        The batch with the parting, and the further area [m^2].
+    """
+    surface = _judged_surface(lines, h, _UNCOVERED_MARGIN * h)
+    places = uncovered_points(mesh, surface, opened, h)
+    if not len(places):
+        return delta, 0.0
+    _, away = nearest_points(Surface(places, places), surface.points)
+    around = away < _AROUND * h
+    surface = Surface(surface.points[around], surface.normals[around])
+    nodes = tables.node_id[: tables.counts[NODES]]
+    local = local_elements(mesh, delta, nodes, lines[0], np.inf, _LAYERS)
+    height = judged_heights(local, surface, np.ones(len(local.corners), bool), h)
+    judged = np.abs(height) < _TUBE * h
+    faces = least_faces(local, surface, judged, height > _CLEAR * h, height < -_CLEAR * h, h)
+    return open_faces(mesh, delta, local, faces) if len(faces) else (delta, 0.0)
+
+
 def _sides(local: Local, tables: Tables, first_new: int) -> tuple[Mask, Mask]:
     """Return which elements lie on each side of a stroke by their nodes, each shape (k,)."""
     side = np.zeros(len(local.nodes), np.int8)
@@ -87,8 +128,14 @@ def _sides(local: Local, tables: Tables, first_new: int) -> tuple[Mask, Mask]:
     return plus & ~minus, minus & ~plus
 
 
-def _judged_surface(lines: Floats, h: float) -> Surface:
-    """Return the surface that a stroke has swept, away from its borders and its other sheets."""
+def _judged_surface(lines: Floats, h: float, margin: float) -> Surface:
+    """Return the surface that a stroke has swept, away from its borders and its other sheets.
+
+    Args:
+        lines: as of `part_bridges`.
+        h: length of an edge [m].
+        margin: width of the strip along a border that is left out [m].
+    """
     steps = np.linalg.norm(np.diff(lines, axis=0), axis=2).mean(axis=1)
     runs = np.split(lines, np.flatnonzero(steps > GAP * h) + 1)
     runs = [_filled(run, h) for run in runs if len(run) > 1]
@@ -97,7 +144,7 @@ def _judged_surface(lines: Floats, h: float) -> Surface:
     longest = max(np.linalg.norm(run[:, 1] - run[:, 0], axis=1).max() for run in runs)
     across = np.linspace(0, 1, int(np.ceil(longest / (_STEP * h))) + 1)
     points, normals, judged, ways = [], [], [], []
-    margin, before = _MARGIN * h, 0.0
+    before = 0.0
     for run in runs:
         edges = run[:, 1] - run[:, 0]
         at = run[:, :1] + across[:, None] * edges[:, None]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from cutting_trainer.cutting.batch import CutStateError, Scheme, build_batch, give_up_edges
-from cutting_trainer.cutting.bridges import part_bridges
+from cutting_trainer.cutting.bridges import part_bridges, part_uncovered
 from cutting_trainer.cutting.broad_phase import quad
 from cutting_trainer.cutting.coverage import closed_area
 from cutting_trainer.cutting.crossings import find_hits, lengthened, met_tetrahedra, surfaces
@@ -184,13 +184,19 @@ class CombinedMethod:
         delta, more = part_junctions(mesh, delta, nodes, ends, self._strips, h)
         self._strips = [*self._strips, *ends][-_MAX_STRIPS:]
         area += more
-        small = self._limits().small
-        delta, more, opened = slide_front(mesh, delta, nodes, self._first_new, lines, h, small)
         said = [_HOLDS.format(*1e3 * place) for place in places[:1]]
+        front = self._first_new, lines, h, self._limits().small
+        delta, more, opened = slide_front(mesh, delta, nodes, *front)
+        area += more
+        delta, more = part_uncovered(mesh, delta, self._tables, opened, lines, h)
+        if more > 0.0:
+            area += more
+            delta, more, opened = slide_front(mesh, delta, nodes, *front)
+            area += more
         closed, middle = closed_area(mesh, lines, opened, h)
         if closed > 0.0 and not folded:
             said.append(_CLOSED.format(1e4 * closed, *1e3 * middle, 1e3 * h))
-        return delta, area + more, said
+        return delta, area, said
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
         """Lead the cut on where a stroke ends inside the tissue."""

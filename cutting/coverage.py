@@ -2,19 +2,83 @@
 
 import numpy as np
 
-from cutting_trainer.cutting.bridges import GAP
 from cutting_trainer.cutting.front import Opened
-from cutting_trainer.cutting.parting import Floats
+from cutting_trainer.cutting.parting import Floats, Surface
+from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.mesh.locate import distances_to_triangles, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 
+GAP = 1.0
+"""Way between two remembered places of the blade from which it was outside between, in edges."""
 _STEP = 0.25
 """Way between two places that are looked at, in edges."""
 _NEAR = 0.6
 """Distance from the opened faces up to which a place counts as opened, in edges."""
 _MIN_AREA = 0.5
 """Closed area that matters, in squared edges."""
+
+
+def uncovered_points(mesh: TetMesh, surface: Surface, opened: Opened, h: float) -> Floats:
+    """Return the points of a swept surface without an opened face before or behind them.
+
+    Unlike `closed_area`, this finds a strip that is narrower than an edge.
+
+    Args:
+        mesh: the tissue.
+        surface: swept, away from its borders, where a cut ends within half an edge.
+        opened: faces opened by cuts around the stroke.
+        h: length of an edge [m].
+
+    Returns:
+        In the rest shape [m], shape (k, 3).
+    """
+    found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, surface.points)
+    inside = found >= 0
+    points, normals = surface.points[inside], surface.normals[inside]
+    earlier = mesh.triangles[mesh.triangle_kind == CUT].astype(np.int64)
+    covered = _covered(points, normals, _NEAR * h, opened.rest, opened.triangles)
+    covered |= _covered(points, normals, _NEAR * h, mesh.rest, earlier)
+    return points[~covered]
+
+
+@kernel
+def _covered(points, normals, reach, rest, triangles):
+    """Return whether a line through each point meets a triangle, shape (p,).
+
+    Args:
+        points: [m], shape (p, 3).
+        normals: unit vectors along the lines, shape (p, 3).
+        reach: of the lines, before and behind [m].
+        rest: nodes [m], shape (n, 3).
+        triangles: shape (t, 3).
+    """
+    covered = np.zeros(len(points), np.bool_)
+    away, sides = np.empty((3, 3)), np.empty(3)
+    for k in range(len(points)):
+        for t in range(len(triangles)):
+            least = most = 0.0
+            for j in range(3):
+                height = 0.0
+                for i in range(3):
+                    away[j, i] = rest[triangles[t, j], i] - points[k, i]
+                    height += away[j, i] * normals[k, i]
+                least, most = (
+                    (height, height) if j == 0 else (min(least, height), max(most, height))
+                )
+            if least > reach or most < -reach:
+                continue
+            for j in range(3):  # signed areas seen along the line: all of one sign inside
+                a, b, n = away[j], away[(j + 1) % 3], normals[k]
+                sides[j] = (
+                    n[0] * (a[1] * b[2] - a[2] * b[1])
+                    + n[1] * (a[2] * b[0] - a[0] * b[2])
+                    + n[2] * (a[0] * b[1] - a[1] * b[0])
+                )
+            if sides.min() >= 0.0 or sides.max() <= 0.0:
+                covered[k] = True
+                break
+    return covered
 
 
 def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple[float, Floats]:

@@ -70,7 +70,7 @@ class Drawn:
         self.areas: list[float] = []
         self.gaps: list[float] = []
         self.ahead: list[float] = []
-        self.paid, end = 0.0, np.full((10, 3), np.nan)
+        self.paid, end = 0.0, np.full((20, 3), np.nan)
         for tip in np.concatenate(ways):
             contact = replace(contact_at(simulation, tip), stiffness=80.0)
             inside = simulation.blade
@@ -99,8 +99,8 @@ class Drawn:
 
 
 def places(tip: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Places of an edge 1 to 7 mm from its tip [m], shape (10, 3)."""
-    way = np.linspace(0.001, 0.007, 10)[:, None]
+    """Places of an edge 1 to 7 mm from its tip [m], shape (20, 3)."""
+    way = np.linspace(0.001, 0.007, 20)[:, None]
     return np.asarray(tip + way * (root - tip) / np.linalg.norm(root - tip))
 
 
@@ -129,6 +129,29 @@ def test_nothing_is_left_out_between_two_sweeps_where_the_tissue_bends_the_edge(
     ahead = np.array(Drawn(0.0, youngs_modulus=5000.0).ahead)
     assert np.isfinite(ahead).sum() > 100
     assert np.nanmax(ahead) < 5e-5  # a hundredth of an edge
+
+
+def test_an_edge_that_goes_in_along_itself_asks_for_nothing_whatever_its_tremor() -> None:
+    """Its sweep would have the direction of the tremor; the first one begins at full depth."""
+    nodes, tets = irregular_box((12, 6, 4), 0.005, 3, jitter=0.1)
+    simulation = TissueSimulation(
+        TetMesh(nodes, tets, nodes[:, 2] < 1e-9),
+        Material(30000.0, 0.4, 1000.0, 5.0, 2e-4),
+        Resistance(0.05, TOUGHNESS, 0.0),
+    )
+    start = np.array([0.020, 0.0138, TOP + 0.001])
+    deep, along = start - [0.0, 0.0, 0.012], np.array([0.02, 0.0, 0.0])
+    down, on = np.linspace(start, deep, 15), eased(deep, deep + along, 0.5, RATE)
+    down[:, 1] += 1e-4 * np.sin(2.0 * np.pi * 9.0 / RATE * np.arange(len(down)))
+    sweeps = []
+    for number, tip in enumerate(np.concatenate([down, on])):
+        frame = simulation.frame(contact_at(simulation, tip))
+        if frame.sweep is not None:
+            sweeps.append((number, frame.sweep))
+            simulation.cut_done()
+    assert sweeps[0][0] >= len(down)
+    first = sweeps[0][1]
+    assert first.tip_from[2] - first.tip_to[2] < 1e-3
 
 
 def test_an_edge_that_leaves_just_after_a_cut_does_not_ask_for_nodes_of_the_old_mesh() -> None:

@@ -239,6 +239,18 @@ def test_a_swept_area_that_stays_closed_is_said_and_nothing_else_is():
     assert closed > 0
 
 
+def test_a_strip_that_the_sweeps_have_left_is_parted_at_the_end_of_the_stroke():
+    """The blade goes on half an edge farther than its last sweep ended."""
+    block = organ_of('block', *good_block((8, 8, 6), 0.005, seed=101))
+    for angle in ANGLES:
+        path, mesh = straight(block, 2.0, angle)[0].paths[0], TetMesh(block.nodes, block.tetrahedra)
+        way = (path.mean(axis=1) - block.middle) @ [np.cos(angle), np.sin(angle), 0.0]
+        method = method_named()
+        draw(method, mesh, path[way < -0.25 * block.h], finish=False)
+        draw(method, mesh, path[way > 0.25 * block.h])
+        assert opened_share(block, mesh, 2.0, angle) > 0.92
+
+
 def test_ends_of_strokes_that_meet_beside_the_tissue_part_nothing(plate):
     """The last batch of a stroke may only move nodes, none of them near where two ends meet."""
     mesh = TetMesh(plate.nodes, plate.tetrahedra)

@@ -30,6 +30,8 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, tetrahedron_volu
 
 _MIN_AREA = 1e-8
 _MIN_WAY = 1e-12
+_MIN_ACROSS = 0.3
+"""Motion across the edge, as a share of all motion, from which on a sweep has a direction."""
 _MEDIAN_SAMPLES = 20000
 """Elements in the sample for a median."""
 
@@ -397,9 +399,38 @@ class Blade:
         if Sweep(root, tip, root_to, tip_to).area <= _MIN_AREA:
             return None
         way = np.array([root_to - root, tip_to - tip])
+        if self._to is None and not self._is_across(way):
+            return None
         way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _MIN_WAY)
         back = way * self._gap(way)
         return Sweep(root - back[0], tip - back[1], root_to, tip_to)
+
+    def _is_across(self, way: np.ndarray) -> bool:
+        """Return whether a motion of root and tip [m], shape (2, 3), leads across the edge."""
+        across = np.linalg.norm(self._across(way), axis=1).max()
+        return bool(across >= _MIN_ACROSS * np.linalg.norm(way, axis=1).max())
+
+    def _across(self, way: np.ndarray) -> np.ndarray:
+        """Return the part of a motion of root and tip across the edge [m], shape (2, 3)."""
+        along = self._edge / max(float(np.linalg.norm(self._edge)), _MIN_WAY)
+        return np.asarray(way - np.outer(way @ along, along))
+
+    def sink(self) -> None:
+        """Let the begin of the next sweep go along with an edge that moves along itself.
+
+        That motion sweeps nothing. Its sweep would have the direction of the tremor, and would put
+        nodes on the wrong side of the cut for good.
+        """
+        if self._to is not None or self._failed or not self._state.spans.any():
+            return
+        root, tip = self._tip + self._edge, self._tip
+        way = np.array([root - self._cut_tip - self._cut_edge, tip - self._cut_tip])
+        if self._is_across(way):
+            return
+        across = self._across(way)
+        self._cut_tip = tip - across[1]
+        self._cut_edge = root - across[0] - self._cut_tip
+        self._from = anchor_of(self._state)
 
     def _gap(self, way: np.ndarray) -> float:
         """Return by how much the straight start of a sweep is ahead of the bent one [m].
