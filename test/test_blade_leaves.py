@@ -70,7 +70,7 @@ class Drawn:
         self.areas: list[float] = []
         self.gaps: list[float] = []
         self.ahead: list[float] = []
-        self.paid, end = 0.0, np.full((20, 3), np.nan)
+        self.paid, end = 0.0, np.full((40, 3), np.nan)
         for tip in np.concatenate(ways):
             contact = replace(contact_at(simulation, tip), stiffness=80.0)
             inside = simulation.blade
@@ -99,8 +99,8 @@ class Drawn:
 
 
 def places(tip: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Places of an edge 1 to 7 mm from its tip [m], shape (20, 3)."""
-    way = np.linspace(0.001, 0.007, 20)[:, None]
+    """Places of an edge 1 to 7 mm from its tip [m], shape (40, 3)."""
+    way = np.linspace(0.001, 0.007, 40)[:, None]
     return np.asarray(tip + way * (root - tip) / np.linalg.norm(root - tip))
 
 

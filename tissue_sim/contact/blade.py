@@ -32,6 +32,9 @@ _MIN_AREA = 1e-8
 _MIN_WAY = 1e-12
 _MIN_ACROSS = 0.3
 """Motion across the edge, as a share of all motion, from which on a sweep has a direction."""
+_MIN_FIRST = 0.1
+"""Motion across the edge from which on the first sweep has one, in sizes of an element: the cut is
+led on behind it."""
 _MEDIAN_SAMPLES = 20000
 """Elements in the sample for a median."""
 
@@ -112,7 +115,7 @@ class Blade:
         rubbed: work of friction since entry [J].
     """
 
-    _renumbered = False  # a state of before may lack it
+    _renumbered, _begun = False, True  # a state of before may lack them
 
     def __init__(
         self,
@@ -152,7 +155,7 @@ class Blade:
         self._back: np.ndarray | None = None
         self._from: Anchor | None = None
         self._to: Anchor | None = None
-        self._failed = self._set_back = False
+        self._failed = self._set_back = self._begun = False
         self.paid = self.rubbed = self._swept = 0.0
         self._settle(no_pull())
 
@@ -408,7 +411,8 @@ class Blade:
     def _is_across(self, way: np.ndarray) -> bool:
         """Return whether a motion of root and tip [m], shape (2, 3), leads across the edge."""
         across = np.linalg.norm(self._across(way), axis=1).max()
-        return bool(across >= _MIN_ACROSS * np.linalg.norm(way, axis=1).max())
+        least = 0.0 if self._begun else _MIN_FIRST * self._element
+        return bool(across >= max(_MIN_ACROSS * np.linalg.norm(way, axis=1).max(), least))
 
     def _across(self, way: np.ndarray) -> np.ndarray:
         """Return the part of a motion of root and tip across the edge [m], shape (2, 3)."""
@@ -448,7 +452,7 @@ class Blade:
 
     def confirm_sweep(self) -> None:
         """Start the next sweep from the present edge."""
-        self._swept, self._from = 0.0, None
+        self._swept, self._from, self._begun = 0.0, None, True
         self._before = (self._cut_tip - self._tip, self._cut_edge, self._back)
         self._cut_tip = self._tip.copy()
         self._cut_edge = self._edge.copy()
