@@ -1,6 +1,7 @@
 """Coverage: whether the mesh has opened the surface that a stroke has swept."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cutting_trainer.cutting.front import Opened
 from cutting_trainer.cutting.parting import Floats, Surface
@@ -36,10 +37,28 @@ def uncovered_points(mesh: TetMesh, surface: Surface, opened: Opened, h: float) 
     found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, surface.points)
     inside = found >= 0
     points, normals = surface.points[inside], surface.normals[inside]
-    earlier = mesh.triangles[mesh.triangle_kind == CUT].astype(np.int64)
-    covered = _covered(points, normals, _NEAR * h, opened.rest, opened.triangles)
+    earlier = _cuts_around(mesh, points, _NEAR * h)
+    new = opened.triangles.astype(earlier.dtype)
+    covered = _covered(points, normals, _NEAR * h, opened.rest, new)
     covered |= _covered(points, normals, _NEAR * h, mesh.rest, earlier)
     return points[~covered]
+
+
+def _cuts_around(mesh: TetMesh, points: Floats, reach: float) -> NDArray[np.integer]:
+    """Return the faces of earlier cuts in a box around some points, shape (t, 3).
+
+    Args:
+        mesh: the tissue.
+        points: at rest [m], shape (p, 3).
+        reach: from the points to the sides of the box [m].
+    """
+    triangles = mesh.triangles[mesh.triangle_kind == CUT]
+    if not len(points):
+        return triangles[:0]
+    corners = mesh.rest[triangles]
+    low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+    met = (corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)
+    return triangles[met.all(axis=1)]
 
 
 @kernel
@@ -109,7 +128,7 @@ def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple
     outside = np.linalg.norm(along, axis=2).mean(axis=1) > GAP * h
     inside = (found >= 0) & ~np.repeat(outside, count)
     places, areas = places[inside], areas[inside]
-    earlier = mesh.triangles[mesh.triangle_kind == CUT]
+    earlier = _cuts_around(mesh, places, _NEAR * h)
     new = opened.triangles.astype(earlier.dtype)
     distance = distances_to_triangles(places, opened.rest, new)
     closed = np.minimum(distance, distances_to_triangles(places, mesh.rest, earlier)) > _NEAR * h
