@@ -152,6 +152,8 @@ def test_an_edge_that_goes_in_along_itself_asks_for_nothing_whatever_its_tremor(
     assert sweeps[0][0] >= len(down)
     first = sweeps[0][1]
     assert first.tip_from[2] - first.tip_to[2] < 1e-3
+    way = first.tip_to - first.tip_from
+    assert way[0] > 3.0 * abs(way[1])  # the cut is led on behind it, along x
 
 
 def test_an_edge_that_leaves_just_after_a_cut_does_not_ask_for_nodes_of_the_old_mesh() -> None:
