@@ -2,8 +2,8 @@
 
 An element whose nodes are all on the cut, though not all of them on the swept surface, is given a
 side by itself; the faces between such elements need not close the cut. At the end of a stroke, the
-tissue that still connects its two sides is parted by a least cut. So is tissue that a blade has
-swept without opening it, where an earlier motion put nodes on the wrong side.
+tissue that still connects its two sides is parted by a least cut. Tissue that a blade has swept
+without opening it is parted, too: an earlier motion has put nodes on the wrong side there.
 """
 
 import numpy as np
@@ -41,7 +41,9 @@ _UNCOVERED_MARGIN = 0.5
 _SHEET = 0.4
 """Distance from the tangent plane up to which another place is of the same sheet, in edges."""
 _STEP = 0.2
-_TRIES, _LAYERS = 2, 2
+_TRIES = 2
+_LAYERS = 2
+"""Layers of elements around those of the stroke through which tissue may hang on."""
 
 
 def part_bridges(

@@ -224,10 +224,10 @@ class TissueSimulation:
         if blade is not None and sweep is not None:
             blade.confirm_sweep()
             self._outstanding = CutCommand.ADVANCE
+        elif self._finish_due:
+            self._left, self._finish_due, self._outstanding = None, False, CutCommand.FINISH
         elif blade is not None:
             blade.sink()
-        if sweep is None and self._finish_due:
-            self._left, self._finish_due, self._outstanding = None, False, CutCommand.FINISH
         return self._outstanding, sweep
 
     @property
