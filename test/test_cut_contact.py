@@ -82,6 +82,17 @@ def test_the_faces_of_a_cut_do_not_pass_through_each_other(
     assert overlap(cut.mesh, cut.positions) < 1e-4
 
 
+def test_rounding_does_not_choose_among_the_triangles_on_which_a_node_lies() -> None:
+    """In a cut that has just opened, these are all around its twin."""
+    mesh, rng = parted(), np.random.default_rng(5)
+    contact, still = cut_contact.CutContact(mesh, 0.3), np.zeros_like(mesh.rest)
+    expected, _ = contact.find(still, still, 1e-4, 10)
+    assert len(expected.nodes) == np.unique(expected.nodes[:, 0]).size > 0
+    for _ in range(20):
+        near, _ = contact.find(rng.uniform(-1e-12, 1e-12, still.shape), still, 1e-4, 10)
+        assert np.array_equal(near.nodes, expected.nodes)
+
+
 def test_faces_that_begin_in_one_another_are_moved_apart_and_that_is_no_divergence() -> None:
     """Their work is known, so that frames are neither taken back nor end where they began."""
     bar = Dynamics(parted(-0.0006), Material(E, 0.0, 1000.0, 20.0, 2e-4))

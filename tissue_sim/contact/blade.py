@@ -401,12 +401,17 @@ class Blade:
         tip_to, root_to = self._tip, self._tip + self._edge
         if Sweep(root, tip, root_to, tip_to).area <= _MIN_AREA:
             return None
-        way = np.array([root_to - root, tip_to - tip])
+        way = self._way()
         if self._to is None and not self._is_across(way):
             return None
         way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _MIN_WAY)
         back = way * self._gap(way)
         return Sweep(root - back[0], tip - back[1], root_to, tip_to)
+
+    def _way(self) -> np.ndarray:
+        """Return the motion of root and tip since the last sweep ended [m], shape (2, 3)."""
+        tip = self._tip - self._cut_tip
+        return np.array([tip + self._edge - self._cut_edge, tip])
 
     def _is_across(self, way: np.ndarray) -> bool:
         """Return whether a motion of root and tip [m], shape (2, 3), leads across the edge."""
@@ -427,13 +432,12 @@ class Blade:
         """
         if self._to is not None or self._failed or not self._state.spans.any():
             return
-        root, tip = self._tip + self._edge, self._tip
-        way = np.array([root - self._cut_tip - self._cut_edge, tip - self._cut_tip])
+        way = self._way()
         if self._is_across(way):
             return
-        across = self._across(way)
-        self._cut_tip = tip - across[1]
-        self._cut_edge = root - across[0] - self._cut_tip
+        root, tip = self._across(way)
+        self._cut_tip = self._tip - tip
+        self._cut_edge = self._edge - root + tip
         self._from = anchor_of(self._state)
 
     def _gap(self, way: np.ndarray) -> float:

@@ -18,6 +18,9 @@ from cutting_trainer.tissue_sim.mesh.topology import CUT
 
 REACH = 5e-4
 """[m] Distance up to which faces are near; more where they are fast."""
+_SAME = 1e-6
+"""[m] Distance up to which triangles are equally near. In a cut that has just opened, a node lies
+on all triangles around its twin, and rounding would choose among them."""
 _DEPTH = 0.3
 """Depth at which a node is still taken to be in front of a triangle, by the triangle's size."""
 _ONE_SIDED = 0.3
@@ -156,7 +159,10 @@ def find_contacts(links, rest, u, v, seconds):
                 continue
             cosine = nx * normals[k, 0] + ny * normals[k, 1] + nz * normals[k, 2]
             gap = px * normals[k, 0] + py * normals[k, 1] + pz * normals[k, 2]
-            if cosine > _OPPOSED * length or gap > reach or abs(gap) >= nearest:
+            distance = max(abs(gap), _SAME)
+            if cosine > _OPPOSED * length or gap > reach or distance > nearest:
+                continue
+            if distance == nearest and k > best:
                 continue
             if gap < -_DEPTH * sizes[k] or _opposite(links, cut[k]) == node:
                 continue
@@ -164,7 +170,7 @@ def find_contacts(links, rest, u, v, seconds):
             b, c = foot(*_edges(corners, k), px, py, pz)
             beside = min(min(b, c), 1.0 - b - c) < -_BESIDE
             if not (beside or _through_tissue(links, rest, cut[k], node)):
-                nearest, best = abs(gap), k
+                nearest, best = distance, k
         if best < 0:
             continue
         found[contacts, 0] = node
