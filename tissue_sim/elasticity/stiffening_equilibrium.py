@@ -4,6 +4,7 @@ A difference quotient of forces and full steps lose their way where points of th
 turn far. Here each step lowers the energy, so that a stable equilibrium is found.
 """
 
+import contextlib
 from collections.abc import Callable
 
 import numpy as np
@@ -103,6 +104,11 @@ class _Points:
         energy = _points(h, self._volume, self._constants, self._tolerance, stress, change)
         return energy, self._transposed @ stress.ravel(), change
 
+    def any_inside_out(self, u: Floats) -> bool:
+        """Return whether a point has no volume left or is turned inside out."""
+        h = (self._operator @ u).reshape(-1, 3, 3)
+        return bool((np.linalg.det(np.eye(3) + h) <= 0.0).any())
+
     def assembled(self, change: Floats, projected: bool) -> csr_matrix:
         """Return the stiffness of tangents, of their positive parts if projected."""
         change = 0.5 * (change + np.swapaxes(change, 1, 2))
@@ -162,10 +168,14 @@ class LawEquilibrium:
         energy = sum(f[0] for f in found) - float(load @ u)
         return energy, (load - sum(f[1] for f in found))[self._free], [f[2] for f in found]
 
+    def _stiffness(self, tangents: list[Floats], projected: bool) -> csr_matrix:
+        """Return the stiffness of all points; arguments as of `_Points.assembled`."""
+        parts = [k.assembled(t, projected) for k, t in zip(self._kinds, tangents, strict=True)]
+        return sum(parts[1:], parts[0])
+
     def _step(self, tangents: list[Floats], out: Floats, projected: bool) -> Floats | None:
         """Return a Newton step, None where the energy is not convex."""
-        parts = [k.assembled(t, projected) for k, t in zip(self._kinds, tangents, strict=True)]
-        matrix = sum(parts[1:], parts[0])[self._free][:, self._free].tocsr()
+        matrix = self._stiffness(tangents, projected)[self._free][:, self._free].tocsr()
         for attempt in range(2):
             if self._factors is None or attempt:
                 try:
@@ -184,23 +194,49 @@ class LawEquilibrium:
     def find(
         self, load: Floats, start: Floats, *, tolerance: float = 1e-6, iterations: int = 60
     ) -> Floats:
-        """Return the displacement under constant forces; arguments as of `equilibrium`."""
-        u, force = start.ravel().copy(), load.ravel()
-        largest, projected = 0.0, False
+        """Return the displacement under constant forces; arguments as of `equilibrium`.
+
+        Points that are inside out can hold each other, or leave no way on. Then the descent begins
+        again at the shape of a linear tissue, and the end with less energy is returned.
+        """
+        force, found = load.ravel(), []
+        with contextlib.suppress(MeshError):
+            found.append(self._descend(force, start.ravel().copy(), tolerance, iterations))
+        if not found or any(kind.any_inside_out(found[0]) for kind in self._kinds):
+            try:
+                linear = self._linear(force, start)
+                found.append(self._descend(force, linear, tolerance, iterations))
+            except MeshError:
+                if not found:
+                    raise
+        return min(found, key=lambda u: self._evaluate(u, force, False)[0]).reshape(-1, 3)
+
+    def _linear(self, load: Floats, start: Floats) -> Floats:
+        """Return the displacement of a linear tissue, held as in `start` [m], shape (3 n,)."""
+        u = np.where(self._free, 0.0, start.ravel())
+        tangents = self._evaluate(np.zeros_like(u), load, True)[2]
+        matrix = self._stiffness(tangents, False)
+        out = (load - matrix @ u)[self._free]
+        u[self._free] = splu(matrix[self._free][:, self._free].tocsc()).solve(out)
+        return u
+
+    def _descend(self, load: Floats, u: Floats, tolerance: float, iterations: int) -> Floats:
+        """Return the end of a path on which the energy falls [m], shape (3 n,)."""
+        largest = 0.0
         for _ in range(iterations):
-            energy, out, tangents = self._evaluate(u, force, True)
+            energy, out, tangents = self._evaluate(u, load, True)
             size = float(np.linalg.norm(out))
             if not np.isfinite(size):
                 break
             largest = max(largest, size)
             if size <= tolerance * largest:
-                return u.reshape(-1, 3)
-            step = self._step(tangents, out, projected)
+                return u
+            step = self._step(tangents, out, False)
             if step is None or float(step @ out) <= 0.0:
                 step = self._step(tangents, out, True)
             if step is None:
                 break
-            u = self._along(u, step, energy, float(step @ out), force)
+            u = self._along(u, step, energy, float(step @ out), load)
         raise MeshError(
             f'no equilibrium after {iterations} Newton steps: {size / largest:.1e} of the residual '
             'is left; apply the load in smaller parts'
