@@ -62,6 +62,14 @@ def test_a_concession_is_taken_back_when_there_is_time_and_does_not_come_and_go(
     assert np.count_nonzero(np.diff(taken)) == 1
 
 
+def test_each_concession_is_taken_back_after_a_calm_of_its_own() -> None:
+    governor = Governor(PERIOD, 2)
+    governed(0.05, PERIOD, 9, governor)
+    taken = governed(0.01, 0.0, 2000, governor)
+    first, second = (taken.index(concession) for concession in (1, 0))
+    assert second - first == first + 1
+
+
 @pytest.mark.long
 def test_what_is_conceded_is_far_from_the_tool_and_the_force_does_not_jump() -> None:
     def pressed(concessions: tuple[int, ...]) -> tuple[list[int], np.ndarray, np.ndarray]:

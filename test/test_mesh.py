@@ -116,6 +116,21 @@ def test_where_a_node_slides_all_tensors_around_it_follow() -> None:
     assert_tensors_equal_a_rebuild(model)
 
 
+@pytest.mark.parametrize('count', [1, 40])
+def test_all_nodes_around_a_node_that_slides_are_touched(count: int) -> None:
+    nodes, tets = irregular_box((2, 2, 2), 0.01, 1, 0.1)
+    tets = tets[:count]
+    for node in np.unique(tets):
+        mesh = TetMesh(nodes, tets)
+        delta = TopologyDelta(
+            moved_nodes=np.array([node]),
+            moved_parents=np.full((1, 4), node),
+            moved_weights=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        )
+        around = np.unique(tets[(tets == node).any(axis=1)])
+        assert np.array_equal(mesh.apply(delta).nodes, around), node
+
+
 def test_a_split_inside_leaves_the_surface_and_its_kind() -> None:
     mesh = TetMesh(*irregular_box((2, 2, 2), 0.01, 1))
     before = {tuple(sorted(t)) for t in mesh.triangles.tolist()}

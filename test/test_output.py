@@ -10,6 +10,7 @@ import subprocess
 import sys
 import termios
 import textwrap
+import threading
 import time
 from array import array
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ import pytest
 from test_supervisor import FAKE, ROOT, Ledger, ledger, wait_for
 
 from bench.figures.trust_output import watch
+from cutting_trainer.node_common.output import MAX_BUFFERED_BYTES, Outlet
 from cutting_trainer.node_common.timing import MAX_TIMELY_LATENESS_S
 from cutting_trainer.session.node_commands import ARM_NODE, BRIDGE_NODE
 
@@ -106,6 +108,20 @@ def test_loops_keep_their_rate_and_the_bridge_answers_while_nobody_reads_their_l
     assert seen.stopped
     for quiet, unread in seen.usual.values():
         assert unread < 10 * max(quiet, MAX_TIMELY_LATENESS_S)
+
+
+def test_each_line_of_a_full_queue_is_written_or_counted() -> None:
+    reader, writer = os.pipe()
+    outlet, line = Outlet(writer, 'nobody'), b'x' * 1023 + b'\n'
+    count = 2 * MAX_BUFFERED_BYTES // len(line)
+    for _ in range(count):
+        outlet.put(line)
+    dropped = outlet.dropped
+    assert dropped > 0
+    threading.Thread(target=outlet.close, args=(10.0,)).start()
+    with os.fdopen(reader, 'rb') as file:
+        written = sum(row == line for row in file)
+    assert written + dropped == count
 
 
 @pytest.mark.parametrize('how', ['queued', 'as it was'])

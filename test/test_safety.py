@@ -26,6 +26,7 @@ def test_a_pose_with_a_number_that_is_none_is_refused(bad, where):
     pose = np.concatenate([vector(0.1, 0, 0), UNIT])
     pose[where] = bad
     assert safety.pose_gate(pose[:3], pose[3:]) == safety.NOT_FINITE
+    assert judge(np.zeros(1, GATE), pose, 10**9, False) == safety.NOT_FINITE
 
 
 @pytest.mark.parametrize('scale', [0.0, 0.9, 1.1])
@@ -35,7 +36,9 @@ def test_an_orientation_that_is_no_rotation_is_refused(scale):
 
 
 def test_millimetres_sent_as_metres_are_refused():
-    assert safety.pose_gate(vector(0, 0, 120), UNIT) == safety.OUT_OF_RANGE
+    for place in 120 * np.eye(3):
+        pose = np.concatenate([place, UNIT])
+        assert judge(np.zeros(1, GATE), pose, 10**9, False) == safety.OUT_OF_RANGE
 
 
 def moved(gate, ms, position=(0, 0, 0), turn=0.0):
