@@ -179,10 +179,7 @@ class LawEquilibrium:
         for attempt in range(2):
             if self._factors is None or attempt:
                 try:
-                    self._factors = splu(
-                        matrix.tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
-                        options={'SymmetricMode': True},
-                    )  # fmt: skip
+                    self._factors = _factorised(matrix)
                 except RuntimeError:  # singular: at the end of a stable path
                     self._factors = None
                     return None
@@ -196,20 +193,31 @@ class LawEquilibrium:
     ) -> Floats:
         """Return the displacement under constant forces; arguments as of `equilibrium`.
 
-        Points that are inside out can hold each other, or leave no way on. Then the descent begins
-        again at the shape of a linear tissue, and the end with less energy is returned.
+        Points that are inside out, or wound twice around a node, can hold each other, or leave no
+        way on. Then the descent begins again at the shape of a linear tissue, and the end with
+        less energy is returned.
         """
-        force, found = load.ravel(), []
+        force, linear = load.ravel(), self._linear(load.ravel(), start)
+        found = []
         with contextlib.suppress(MeshError):
             found.append(self._descend(force, start.ravel().copy(), tolerance, iterations))
-        if not found or any(kind.any_inside_out(found[0]) for kind in self._kinds):
+        if not found or self._is_held_wrongly(found[0], linear, force):
             try:
-                linear = self._linear(force, start)
                 found.append(self._descend(force, linear, tolerance, iterations))
             except MeshError:
                 if not found:
                     raise
-        return min(found, key=lambda u: self._evaluate(u, force, False)[0]).reshape(-1, 3)
+        return min(found, key=lambda u: self._energy(u, force)).reshape(-1, 3)
+
+    def _energy(self, u: Floats, load: Floats) -> float:
+        """Return the potential energy [J]."""
+        return self._evaluate(u, load, False)[0]
+
+    def _is_held_wrongly(self, u: Floats, linear: Floats, load: Floats) -> bool:
+        """Return whether points are inside out, or the linear tissue's shape has less energy."""
+        if any(kind.any_inside_out(u) for kind in self._kinds):
+            return True
+        return self._energy(linear, load) < self._energy(u, load)
 
     def _linear(self, load: Floats, start: Floats) -> Floats:
         """Return the displacement of a linear tissue, held as in `start` [m], shape (3 n,)."""
@@ -217,7 +225,7 @@ class LawEquilibrium:
         tangents = self._evaluate(np.zeros_like(u), load, True)[2]
         matrix = self._stiffness(tangents, False)
         out = (load - matrix @ u)[self._free]
-        u[self._free] = splu(matrix[self._free][:, self._free].tocsc()).solve(out)
+        u[self._free] = _factorised(matrix[self._free][:, self._free]).solve(out)
         return u
 
     def _descend(self, load: Floats, u: Floats, tolerance: float, iterations: int) -> Floats:
@@ -248,12 +256,18 @@ class LawEquilibrium:
         for _ in range(_HALVINGS):
             ahead = u.copy()
             ahead[self._free] += part * step
-            there = self._evaluate(ahead, load, False)[0]
+            there = self._energy(ahead, load)
             # At the end of the convergence rounding is all that changes.
             if there <= energy - 1e-4 * part * slope + 1e-12 * abs(energy):
                 return ahead
             part /= 2
         return ahead
+
+
+def _factorised(matrix: csr_matrix) -> SuperLU:
+    """Return the factors of a symmetric matrix."""
+    order = {'permc_spec': 'MMD_AT_PLUS_A', 'diag_pivot_thresh': 0.0}
+    return splu(matrix.tocsc(), **order, options={'SymmetricMode': True})
 
 
 def _conjugate_gradients(
