@@ -10,20 +10,19 @@ from numba import njit
 from numba.extending import overload, register_jitable
 from numba.np import arrayobj
 
-_OPTIONS = {'cache': True, 'no_cfunc_wrapper': True}
+from cutting_trainer.node_common.linked_code import link_inner_functions
+
+_OPTIONS = {'no_cfunc_wrapper': True}
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function that Python calls, with options of `numba.njit`."""
-    compiled = njit(**_OPTIONS | options)
+    compiled = njit(**_OPTIONS | {'cache': True} | options)
     return compiled if function is None else compiled(function)
 
 
 def inner(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a function where a kernel calls it; Python interprets it.
-
-    Half of a small kernel's compile time is the wrapper by which Python calls it: it has none.
-    """
+    """Compile a function where a kernel calls it, see `linked_code`; Python interprets it."""
     compiled = register_jitable(**_OPTIONS | options)
     return compiled if function is None else compiled(function)
 
@@ -43,3 +42,4 @@ def _raise_in_kernel(source: Any, target: Any) -> Callable[..., None]:
 # The sentence that Numba puts together for it, with both shapes, took a seventh of the time in
 # which the force loop is compiled.
 arrayobj.raise_with_shape_context = _raise_for_shape
+link_inner_functions()
