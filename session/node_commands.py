@@ -9,6 +9,7 @@ from pathlib import Path
 
 from cutting_trainer.node_common.share_folder import PACKAGES, share_folder
 from cutting_trainer.session.node_process import NodeCommand
+from cutting_trainer.session.processors import Work
 
 ARM_NODE, BRIDGE_NODE, TISSUE_NODE = 'emulated_arm', 'haptic_bridge', 'tissue_sim'
 CUTTING_NODE, RECORDER_NODE, VIEWER_NODE = 'cutting', 'recorder', 'viewer'
@@ -29,6 +30,12 @@ SESSION_PUBLISHERS = f'/{ARM_NODE},/{TISSUE_NODE}'
 """Publishers of poses, forces and meshes in a session with the emulated arm."""
 OF_A_TOOL = (ARM_NODE, BRIDGE_NODE)
 """Nodes that each tool has."""
+WORK: dict[str, Work] = {
+    ARM_NODE: 'force loop',
+    BRIDGE_NODE: 'force loop',
+    TISSUE_NODE: 'frames',
+}
+"""Nodes that may get processors of their own."""
 SHARED = (
     *('tissue/mesh', 'tissue/mesh_updates', 'tissue/get_mesh', 'tissue/reset'),
     'haptic_bridge/e_stop',
@@ -225,8 +232,9 @@ def node_command(
         _parameters(given.get(name, {})) for given in (RESTART_PARAMETERS, E_STOP_PARAMETERS)
     )
     return NodeCommand(
-        name, argv, restart_arguments=again, e_stop_arguments=stopped, has_heartbeat=True
-    )
+        name, argv, restart_arguments=again, e_stop_arguments=stopped, has_heartbeat=True,
+        work=WORK.get(name, 'other'),
+    )  # fmt: skip
 
 
 def recorder_command(

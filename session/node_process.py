@@ -13,6 +13,7 @@ from typing import Any
 
 from cutting_trainer.node_common.output import HEARTBEAT, Outlet
 from cutting_trainer.session.parent_death_signal import bound
+from cutting_trainer.session.processors import Work
 
 MAX_TAIL_LINES = 6
 _CRASH = 'Fatal Python error'
@@ -41,6 +42,7 @@ class NodeCommand:
             arguments reads the line `e_stop` on standard input, and writes `e_stop: pressed` or
             `e_stop: released`.
         has_heartbeat: it writes heartbeats once it is ready.
+        work: what it does, by which it may get processors of its own.
     """
 
     name: str
@@ -51,6 +53,7 @@ class NodeCommand:
     restart_arguments: tuple[str, ...] = ()
     e_stop_arguments: tuple[str, ...] = ()
     has_heartbeat: bool = False
+    work: Work = 'other'
 
 
 class _Log:

@@ -1,10 +1,12 @@
 """Start, supervise and end the nodes of a session; nothing is left running."""
 
+import os
 import selectors
 import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +21,7 @@ from cutting_trainer.session.node_process import (
     unready_sentence,
 )
 from cutting_trainer.session.outcome import Death, Outcome, describe
+from cutting_trainer.session.processors import Work, reserved_processors
 from cutting_trainer.session.restart_backoff import Backoff
 
 STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -86,7 +89,8 @@ class Supervisor:
         self.e_stop = EStopState(commands, keys=keys)
         self._commands = commands
         self._logs = log_folder
-        self._group = preferred_group()
+        self._held = ExitStack()
+        self._processors: dict[Work, set[int]] = {}
         self._environment = environment
         self._emit = on_event
         self._nodes: dict[str, NodeProcess] = {}
@@ -102,14 +106,16 @@ class Supervisor:
         for number in STOPPING_SIGNALS:
             self._handlers[number] = signal.signal(number, self._on_signal)
         self.e_stop.keys.__enter__()
-        self._group.__enter__()
+        self._held.enter_context(preferred_group())
+        work = [command.work for command in self._commands]
+        self._processors = self._held.enter_context(reserved_processors(work))
         return self
 
     def __exit__(self, *_: object) -> None:
         try:
             self.end()
         finally:
-            self._group.__exit__(None, None, None)
+            self._held.close()
             self.e_stop.keys.__exit__(None, None, None)
             for number, handler in self._handlers.items():
                 signal.signal(number, handler)  # type: ignore[arg-type]
@@ -251,6 +257,9 @@ class Supervisor:
         node = NodeProcess(
             command, self._logs / f'{command.name.replace("/", ".")}.log', self._environment
         )
+        if command.work in self._processors:
+            with suppress(ProcessLookupError):  # it has just ended
+                os.sched_setaffinity(node.process.pid, self._processors[command.work])
         self._nodes[command.name] = node
         self._selector.register(node.pipe, selectors.EVENT_READ, node)
 
