@@ -32,7 +32,7 @@ _MIN_AREA = 1e-8
 _MIN_WAY = 1e-12
 _MIN_ACROSS = 0.3
 """Motion across the edge, as a share of all motion, from which on a sweep has a direction."""
-_MIN_FIRST = 0.1
+_MIN_FIRST = 0.15
 """Motion across the edge from which on the first sweep has one, in sizes of an element: the cut is
 led on behind it."""
 _MEDIAN_SAMPLES = 20000
