@@ -35,6 +35,7 @@ from cutting_trainer.node_common.cdr_codec import (
 )
 from cutting_trainer.node_common.operating_state import crtk_types
 from cutting_trainer.node_common.realtime import PRIORITY
+from cutting_trainer.node_common.stamps import nanoseconds
 from cutting_trainer.node_common.timing import request_real_time
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -175,7 +176,7 @@ class World:
         while (raw := ros.take_raw(self.contact)) is not None:
             self.record.contacts.append(ContactCodec().decode(raw))
         while (message := ros.take(self.state)) is not None:
-            self.record.states.append((time.time_ns(), message.state))
+            self.record.states.append((nanoseconds(message.header.stamp), message.state))
         while (message := ros.take(self.log)) is not None:
             self.record.said.append(message.msg)
         while (message := ros.take(self.status)) is not None:
