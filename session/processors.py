@@ -1,7 +1,7 @@
 """Processors of a session: force loops on some, the frames of the tissue on the others.
 
 A loop of 1 kHz that wakes on the processor of a frame stops it, even while another processor has
-nothing to do. On two processors frames then took half as long again (docs/performance.md).
+nothing to do. On two processors frames then took half as long again (docs/architecture.md).
 """
 
 import os

@@ -178,10 +178,8 @@ class LawEquilibrium:
         matrix = self._stiffness(tangents, projected)[self._free][:, self._free].tocsr()
         for attempt in range(2):
             if self._factors is None or attempt:
-                try:
-                    self._factors = _factorised(matrix)
-                except RuntimeError:  # singular: at the end of a stable path
-                    self._factors = None
+                self._factors = _factorised(matrix)
+                if self._factors is None:  # at the end of a stable path
                     return None
             step, converged = _conjugate_gradients(matrix, out, self._factors.solve)
             if converged:
@@ -197,12 +195,12 @@ class LawEquilibrium:
         way on. Then the descent begins again at the shape of a linear tissue, and the end with
         less energy is returned.
         """
-        force, linear = load.ravel(), self._linear(load.ravel(), start)
-        found = []
+        force, found = load.ravel(), []
         with contextlib.suppress(MeshError):
             found.append(self._descend(force, start.ravel().copy(), tolerance, iterations))
-        if not found or self._is_held_wrongly(found[0], linear, force):
+        if not found or self._is_held_wrongly(found[0], force):
             try:
+                linear = self._linear(force, start)
                 found.append(self._descend(force, linear, tolerance, iterations))
             except MeshError:
                 if not found:
@@ -213,19 +211,25 @@ class LawEquilibrium:
         """Return the potential energy [J]."""
         return self._evaluate(u, load, False)[0]
 
-    def _is_held_wrongly(self, u: Floats, linear: Floats, load: Floats) -> bool:
-        """Return whether points are inside out, or the linear tissue's shape has less energy."""
+    def _is_held_wrongly(self, u: Floats, load: Floats) -> bool:
+        """Return whether points are inside out, or free nodes in their first places have less
+        energy.
+        """
         if any(kind.any_inside_out(u) for kind in self._kinds):
             return True
-        return self._energy(linear, load) < self._energy(u, load)
+        return self._energy(np.where(self._free, 0.0, u), load) < self._energy(u, load)
 
     def _linear(self, load: Floats, start: Floats) -> Floats:
-        """Return the displacement of a linear tissue, held as in `start` [m], shape (3 n,)."""
+        """Return the displacement of a linear tissue, held as in `start` [m], shape (3 n,).
+
+        Free nodes keep their first places where its stiffness is singular.
+        """
         u = np.where(self._free, 0.0, start.ravel())
         tangents = self._evaluate(np.zeros_like(u), load, True)[2]
         matrix = self._stiffness(tangents, False)
         out = (load - matrix @ u)[self._free]
-        u[self._free] = _factorised(matrix[self._free][:, self._free]).solve(out)
+        if (factors := _factorised(matrix[self._free][:, self._free])) is not None:
+            u[self._free] = factors.solve(out)
         return u
 
     def _descend(self, load: Floats, u: Floats, tolerance: float, iterations: int) -> Floats:
@@ -264,10 +268,13 @@ class LawEquilibrium:
         return ahead
 
 
-def _factorised(matrix: csr_matrix) -> SuperLU:
-    """Return the factors of a symmetric matrix."""
+def _factorised(matrix: csr_matrix) -> SuperLU | None:
+    """Return the factors of a symmetric matrix, None where it is singular."""
     order = {'permc_spec': 'MMD_AT_PLUS_A', 'diag_pivot_thresh': 0.0}
-    return splu(matrix.tocsc(), **order, options={'SymmetricMode': True})
+    try:
+        return splu(matrix.tocsc(), **order, options={'SymmetricMode': True})
+    except RuntimeError:
+        return None
 
 
 def _conjugate_gradients(
