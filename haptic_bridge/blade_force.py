@@ -5,6 +5,11 @@ import numpy as np
 from cutting_trainer.haptic_bridge import extrapolation, safety
 from cutting_trainer.node_common.kernels import inner
 
+_STEPS = 8
+"""Steps in which the way of the tool since a new sample is followed."""
+_MIN_SINE = 0.1
+"""Sine of the angle between force and edge below which it says nothing of the cutting force."""
+
 
 @inner
 def enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> None:
@@ -49,27 +54,123 @@ def pull_blade(
 ) -> None:
     """Compute force and torque of a blade by the stiffness at its newest sample.
 
-    Along itself the blade slips through the tissue, and a part that has left it feels nothing: the
-    force is in proportion to the length that is still in it. Where a crack runs in steps, a sample
-    has those up to its own time; since then, the edge goes on here.
+    The edge goes on in the tissue, along the force, where the force exceeds the resistance:
+    pulled along itself, it meets friction alone. A part that has left the tissue feels nothing: the
+    force is in proportion to the length that is still in it. A sample says where the edge was at
+    its time; from there, the way of the tool is followed again.
     """
-    c, s, h = setup[0], state[0], history[0]
-    arms, most, none, at = s.arms, c.max_stiffness, np.zeros(3), np.empty(3)
-    axis, slip = np.empty(3), 0.0
-    for k in range(3):
-        axis[k] = (arms[0, k] - arms[1, k]) / c.length
-        slip += axis[k] * (s.tip[k] + arms[1, k] - h.position[1, k] - h.arms[1, k])
-    before = 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
-    s.out = min(slip / before, 1.0) if before > 0.0 else 0.0
-    for _ in range(2):
-        for k in range(3):
-            at[k] = s.tip[k] - slip * axis[k] - s.advanced[k]
-        extrapolation.estimate(c.law, history, time, at, none, False, arms, most, out, torque)
-        if c.crack_length == 0.0 or not extrapolation.step_ahead(
-            out, history, s.resistance, c.crack_length, c.blade_friction, c.length, most, s.advanced
-        ):
-            break
+    c, s = setup[0], state[0]
+    length = _length_in_tissue(setup, history)
+    steps = _STEPS if s.renewed else 1
+    s.renewed = False
+    for step in range(1, steps + 1):
+        _force_after(setup, state, history, time, step / steps, out, torque)
+        if _go_on(setup, state, history, length, out):
+            _force_after(setup, state, history, time, step / steps, out, torque)
     left = min(1.0 - s.out, 1.0)
     for k in range(3):
+        # The coupling is as stiff as its scene says where half of the blade is in the tissue.
+        s.stretch[k] = out[k] * 0.5 * c.length / (c.coupling * length) if length > 0.0 else 0.0
         out[k] *= left
         torque[k] *= left
+
+
+@inner
+def _force_after(
+    setup: np.ndarray,
+    state: np.ndarray,
+    history: np.ndarray,
+    time: int,
+    share: float,
+    out: np.ndarray,
+    torque: np.ndarray,
+) -> None:
+    """Compute force and torque on all that was in the tissue, after a share of the tool's way."""
+    c, s, h = setup[0], state[0], history[0]
+    none, at = np.zeros(3), np.empty(3)
+    for k in range(3):
+        at[k] = h.position[1, k] + share * (s.tip[k] - h.position[1, k]) - s.advanced[k]
+    extrapolation.estimate(
+        c.law, history, time, at, none, False, s.arms, c.max_stiffness, out, torque
+    )
+
+
+@inner
+def _length_in_tissue(setup: np.ndarray, history: np.ndarray) -> float:
+    """Return the length of the blade in the tissue at the newest sample [m].
+
+    Places along it from s to s + b have the variance b^2 / 12.
+    """
+    h = history[0]
+    return setup[0].length * np.sqrt(12.0 * max(h.immersed[1] - h.immersed[0] ** 2, 0.0))
+
+
+@inner
+def _go_on(
+    setup: np.ndarray, state: np.ndarray, history: np.ndarray, length: float, force: np.ndarray
+) -> bool:
+    """Let the edge go on where its force exceeds the resistance; return whether it did.
+
+    Where a crack runs in steps, a sample has those up to its own time; since then, they are here.
+
+    Args:
+        setup, state, history: see `force_kernels`; `advanced` and `out` are changed.
+        length: in the tissue at the newest sample [m].
+        force: of that length [N], shape (3,).
+    """
+    c, s, h = setup[0], state[0], history[0]
+    size, limit = safety.norm(force), _largest_force(setup, state, history, length, force)
+    if size <= limit:
+        return False
+    if c.crack_length == 0.0 or not extrapolation.step_ahead(
+        force, history, limit, c.crack_length, c.blade_friction, c.length, c.max_stiffness,
+        s.advanced,
+    ):  # fmt: skip
+        scale, stiffness = extrapolation.rendered_share(h.stiffness, c.max_stiffness), 0.0
+        for k in range(3):
+            for j in range(3):
+                stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
+        if stiffness <= 0.0:
+            return False
+        for k in range(3):
+            s.advanced[k] -= (size - limit) / stiffness * force[k] / size
+    along, before = 0.0, 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
+    for k in range(3):
+        along += s.advanced[k] * (s.arms[0, k] - s.arms[1, k]) / c.length
+    s.out = min(max(h.leaving, 1.0) * along / before, 1.0) if before > 0.0 else 0.0
+    return True
+
+
+@inner
+def _largest_force(
+    setup: np.ndarray, state: np.ndarray, history: np.ndarray, length: float, force: np.ndarray
+) -> float:
+    """Return the force at which the edge goes on [N]; arguments as of `_go_on`.
+
+    It is J l sin(edge, force) + friction, and that of the tip to going deeper, as in
+    `tissue_sim/contact/blade_law.py`. A sample shows how much of the edge has uncut tissue ahead,
+    by the largest force that the edge transmits, or its own force where the blade slips out.
+    """
+    c, s, h = setup[0], state[0], history[0]
+    most = s.resistance
+    if h.leaving > 0.0:
+        most = min(most, safety.norm(h.force[1]))
+    if np.isfinite(c.toughness):
+        rubbing = c.blade_friction * length
+        cosine = _cosine(h.force[1], h.arms[0] - h.arms[1])
+        cutting = max(most - rubbing, 0.0) / max(np.sqrt(1.0 - cosine**2), _MIN_SINE)
+        if c.crack_length == 0.0:
+            cutting = min(cutting, c.toughness * length)
+        cosine = _cosine(force, s.arms[0] - s.arms[1])
+        most = cutting * np.sqrt(1.0 - cosine**2) + rubbing
+        most += c.tip_resistance * max(cosine, 0.0)
+    return most * max(1.0 - s.out, 1.0)
+
+
+@inner
+def _cosine(force: np.ndarray, axis: np.ndarray) -> float:
+    """Return the cosine of the angle between a force and the edge; 0 where there is none."""
+    along, size = 0.0, safety.norm(force) * safety.norm(axis)
+    for k in range(3):
+        along += force[k] * axis[k]
+    return min(max(along / size, -1.0), 1.0) if size > 0.0 else 0.0

@@ -23,6 +23,10 @@ MAX_EXTRAPOLATION = 3.0
 """Length of an extrapolation in sample intervals: one to compute, one to wait, one lost."""
 MIN_SAMPLE_DISTANCE_M = 5e-5
 """[m] Samples closer than this differ by encoder noise only: the force is held instead."""
+_MIN_WAY_M = 1e-4
+"""[m] Way between two samples of a blade from which they show a stiffness."""
+_MIN_LEAVING, _MAX_LEAVING = 0.3, 2.0
+"""Length that leaves the tissue by the way out, from which the blade slips, and at most."""
 _NONE = np.zeros((2, 3))
 _MAX_STIFFNESS_RATIO = 2.0
 """Factor by which the stiffness may change since the newest sample."""
@@ -37,6 +41,7 @@ HISTORY = record_type(
         ('stiffness', 'f8', (3, 3)),  # [N/m] of the newest, -d(force)/d(position)
         ('arms', 'f8', (2, 3)),  # [m] from the tool's tip to root and tip of the blade, then
         ('immersed', 'f8', (2,)),  # mean and mean square of the places along the blade in tissue
+        ('leaving', 'f8'),  # length of the blade that leaves the tissue by its way out; 0: none
         ('depth', 'f8', (3,)),  # [m] from tip to proxy in the contact that the newest answers
         ('topology', 'i8'),
         ('state', 'i8'),
@@ -385,6 +390,55 @@ def push(
     _push(history, time, topology, state, *(np.asarray(array, np.float64) for array in arrays))
 
 
+@inner
+def _leaving(history: np.ndarray, arms: np.ndarray, immersed: np.ndarray) -> float:
+    """Return the length of the blade that has left the tissue by its way out since the last sample.
+
+    0 where it is not drawn out, or takes the tissue along; else 1 to 2: tissue that is let go
+    springs back.
+
+    Args:
+        history: with the positions of both samples, but `immersed` of the last, dtype HISTORY,
+            shape (1,).
+        arms, immersed: of the new sample, as for `push`.
+    """
+    h = history[0]
+    axis = arms[0] - arms[1]
+    length, way = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2), 0.0
+    for k in range(3):
+        way += axis[k] * (h.position[1, k] - h.position[0, k])
+    if way <= _MIN_WAY_M * length:
+        return 0.0
+    # Twice the mean: the tip of the blade is in the tissue.
+    left = 2.0 * length * (h.immersed[0] - immersed[0]) / (way / length)
+    return min(max(left, 1.0), _MAX_LEAVING) if left > _MIN_LEAVING else 0.0
+
+
+@inner
+def _stiffen(history: np.ndarray) -> None:
+    """Raise the stiffness along the last way to that which the two samples show.
+
+    The stiffness of a sample is that of small strains, and tissue stiffens. It is never lowered: a
+    loop with too small a stiffness is not stable.
+
+    Args:
+        history: two samples of a blade, dtype HISTORY, shape (1,); `stiffness` is changed.
+    """
+    h = history[0]
+    way, square, shown, known = h.position[1] - h.position[0], 0.0, 0.0, 0.0
+    for i in range(3):
+        square += way[i] * way[i]
+        shown -= way[i] * (h.force[1, i] - h.force[0, i])
+        for j in range(3):
+            known += way[i] * h.stiffness[i, j] * way[j]
+    more = min(shown, _MAX_STIFFNESS_RATIO * known) - known
+    if square < _MIN_WAY_M**2 or more <= 0.0:
+        return
+    for i in range(3):
+        for j in range(3):
+            h.stiffness[i, j] += more * way[i] * way[j] / square**2
+
+
 @kernel(nogil=True)
 def _push(
     history, time, topology, state, position, force, torque, stiffness, depth, arms, immersed
@@ -404,6 +458,10 @@ def _push(
         h.depth[k] = depth[k]
     if np.any(stiffness):
         h.stiffness[:] = stiffness
+    of_blade = h.count == 2 and immersed[1] > 0.0
+    h.leaving = _leaving(history, arms, immersed) if of_blade else 0.0
+    if of_blade and h.leaving == 0.0:
+        _stiffen(history)
     h.arms[:] = arms
     h.immersed[:] = immersed
     h.topology = topology

@@ -60,6 +60,8 @@ SETUP = record_type(
         ('length', 'f8'),  # [m] of the blade, in the tissue
         ('crack_length', 'f8'),  # [m] of a step of the crack; 0: it runs steadily
         ('blade_friction', 'f8'),  # [N/m]
+        ('toughness', 'f8'),  # [J/m^2]; inf: unknown
+        ('tip_resistance', 'f8'),  # [N]
         ('entry_force', 'f8'),  # [N] that lets the blade in; inf: another rule does
         ('hand_length', 'f8'),  # [m] the same at the hand; 0: the device renders no torque
         ('max_torque', 'f8'),  # [N m]
@@ -91,7 +93,9 @@ STATE = record_type(
         ('entered', 'i8'),  # [ns] pose by which it has, before the tissue says so; 0: it has not
         ('borne', 'f8'),  # [N] that this contact bore although the blade was to go in
         ('out', 'f8'),  # share of the length in the tissue that has left it since the newest sample
-        ('advanced', 'f8', (3,)),  # [m] the edge by steps of a crack since the newest sample
+        ('advanced', 'f8', (3,)),  # [m] the edge in the tissue since the newest sample
+        ('renewed', 'b1'),  # whether that sample has come since the last tick
+        ('stretch', 'f8', (3,)),  # [m] from the device's edge to the one in the tissue
         ('stick', friction.STICK, (1,)),
         ('energy', 'f8'),  # [J] of the passivity observer
         ('damping', 'f8'),  # [N s/m] of the passivity controller
@@ -140,7 +144,7 @@ def make_setup(
     length = math.dist(tool.blade_root, tool.blade_tip)
     setup['length'], setup['max_torque'] = length, profile.max_torque
     setup['hand_length'] = length / frame.scale if profile.max_torque > 0.0 else 0.0
-    names = ['crack_length', 'blade_friction', 'entry_force']
+    names = ['crack_length', 'blade_friction', 'entry_force', 'toughness', 'tip_resistance']
     setup[names] = constants
     setup['body_frame'] = device.force_frame == 'body'
     return setup

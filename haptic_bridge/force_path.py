@@ -312,6 +312,7 @@ class ForcePath:
             reaction.torque_resistance, self._max_resistance * self._length
         )
         self._s['advanced'] = self._s['out'] = 0.0
+        self._s['renewed'] = True
         self._check_entry(reaction)
         if reaction.state == INSIDE:
             held = max(math.hypot(*reaction.force), math.hypot(*reaction.torque) / self._length)
@@ -392,13 +393,15 @@ class ForcePath:
         if inside:
             # The samples of the cut stay: the change of state has already voided the older ones.
             if before != INSIDE:
+                self._s['stretch'] = 0.0
                 self._proxy.reset()
                 self._undented.release()
                 before_cut = self.force_norm / self.haptics.force_scale
                 self._s['held'] = before_cut + self.coupling.setup['slack'][0]
             self._contact = INSIDE
             assert surface is not None
-            self._s['reach'] = self._plausibility.reach(surface, self._blade)
+            edge = self._blade + self._s['stretch']
+            self._s['reach'] = self._plausibility.reach(surface, edge)
             return None
         if before == INSIDE or (before == TOUCHING and not enabled):
             self._leave_contact()

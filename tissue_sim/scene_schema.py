@@ -383,10 +383,13 @@ class TissueSettings(SceneModel):
     @property
     def blade_constants(self) -> BladeConstants:
         """The constants of the blade's law that the force loop knows."""
+        toughness = max(self.material.toughness, *self.region_values('toughness'), 0.0)
         return BladeConstants(
             self.material.crack_length,
             max(self.material.blade_friction, *self.region_values('blade_friction'), 0.0),
             math.inf if self.tip_width else self.cut_threshold,
+            toughness,
+            toughness * self.tip_width,
         )
 
     @model_validator(mode='after')

@@ -1,0 +1,100 @@
+"""The force of a blade that is drawn out of tissue that it loads, with samples and between two."""
+
+import numpy as np
+import pytest
+from rig import FRAME, RADIUS, Rig, lowered, spoiled
+
+from bench.haptics.random_cuts import errors_of
+from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
+from cutting_trainer.tissue_sim.contact.blade_constants import BladeConstants
+
+DEEP = RADIUS - 4e-3
+LENGTH, IMMERSED = 0.020, 0.008
+"""[m] of the blade, in all and in the tissue."""
+TOUGHNESS, FRICTION = 164.0, 5.0
+STIFFNESS = 60.0
+"""[N/m] of tissue and coupling in each direction."""
+ASIDE = 8e-3
+"""[m] by which the hand has moved across the blade."""
+LOAD = 1.2
+"""[N] across the blade, below what cuts."""
+TOOL = ToolSettings(
+    radius=RADIUS, coupling_stiffness=200.0, blade_root=(0, 0, 0.008), blade_tip=(0, 0, -0.012)
+)
+UNCHARTED = (5001, 5012)
+"""Seeds of strokes that no chart has."""
+
+
+def loaded(load: float) -> Rig:
+    """A rig whose blade is in the tissue and has a load across it [N]; no sample follows."""
+    rig = Rig(tool=TOOL, constants=BladeConstants(friction=FRICTION, toughness=TOUGHNESS))
+    rig.run(lowered(4e-3, 300))
+    rig.inside = True
+    mean = IMMERSED / LENGTH / 2
+    rig.spoil = lambda sample: spoiled(
+        sample,
+        force=(-load, 0.0, 0.0),
+        stiffness=tuple(STIFFNESS * np.eye(3).ravel()),
+        resistance=((TOUGHNESS + FRICTION) * IMMERSED,),
+        immersed=(mean, mean**2 * 4 / 3),
+    )
+    rig.run(np.full(2 * FRAME, DEEP))
+    for x in np.append(np.linspace(0.0, ASIDE, FRAME), np.full(2 * FRAME, ASIDE)):
+        rig.tick((float(x), 0.0, DEEP))
+    rig.sim = False
+    return rig
+
+
+def drawn(rig: Rig, way: np.ndarray) -> np.ndarray:
+    """The forces of a rig while its blade is drawn out [N], shape (k, 3); way by tick [m], (k,)."""
+    for z in way:
+        rig.tick((ASIDE, 0.0, DEEP + float(z)))
+    return np.array(rig.forces[-len(way) :])
+
+
+def test_a_loaded_blade_takes_the_tissue_along_until_both_forces_together_cut() -> None:
+    way = np.linspace(0.0, 0.016, 80)
+    forces = drawn(loaded(LOAD), way)
+    sizes, across = np.linalg.norm(forces, axis=1), np.abs(forces[:, 0])
+    # What the tissue bears is J l sin(edge, force) + friction l, and sin(edge, force) = across / F.
+    bound = IMMERSED * (TOUGHNESS * across / sizes + FRICTION)
+    yields = int(np.argmax(sizes > 0.995 * bound))
+    assert 20 < yields < 50
+    np.testing.assert_allclose(across[:yields], LOAD, rtol=1e-3)
+    np.testing.assert_allclose(forces[:yields, 2], -STIFFNESS * way[:yields], atol=2e-3)
+    assert (sizes <= 1.01 * bound).all()
+    assert sizes[-1] < 0.8 * sizes[yields]
+
+
+def test_a_blade_without_load_is_drawn_out_against_its_friction_alone() -> None:
+    way = np.linspace(0.0, 0.006, 60)
+    forces = drawn(loaded(0.0), way)
+    rubs = np.abs(forces[:, 2])
+    assert rubs.max() == pytest.approx(FRICTION * IMMERSED, rel=0.02)
+    # It is in proportion to the length that is still in the tissue.
+    left = IMMERSED - way[-1] + FRICTION * IMMERSED / STIFFNESS
+    assert rubs[-1] == pytest.approx(FRICTION * left, rel=0.1)
+
+
+def test_tissue_that_two_samples_show_to_be_stiffer_is_felt_so_from_then_on() -> None:
+    rig = loaded(LOAD)
+    still, shown = rig.spoil, 1.5 * STIFFNESS
+    rig.spoil = lambda sample: spoiled(
+        still(sample), force=(-LOAD, 0.0, -shown * (sample.values[9] - DEEP))
+    )
+    rig.sim = True
+    drawn(rig, np.linspace(0.0, 2e-3, 2 * FRAME + 1))
+    rig.sim = False
+    forces = drawn(rig, 2e-3 + np.linspace(0.0, 1e-3, 11))[:, 2]
+    np.testing.assert_allclose(np.diff(forces), -shown * 1e-4, rtol=0.05)
+
+
+@pytest.mark.long
+@pytest.mark.thorough
+@pytest.mark.parametrize('seed', UNCHARTED)
+def test_a_blade_that_slices_and_is_withdrawn_feels_as_over_a_tissue_at_1_khz(seed: int) -> None:
+    errors = errors_of(seed)
+    assert errors.peak > 1.0
+    assert errors.p95 < 0.08
+    assert errors.hole < 0.2
+    assert errors.tail < 0.005
