@@ -7,6 +7,8 @@ from cutting_trainer.node_common.kernels import inner
 
 _STEPS = 8
 """Steps in which the way of the tool since a new sample is followed."""
+_MIN_STIFFNESS_N_M = 1e-3
+"""[N/m] below which a force does not fall as the edge goes on."""
 _MIN_SINE = 0.1
 """Sine of the angle between force and edge below which it says nothing of the cutting force."""
 
@@ -130,7 +132,7 @@ def _go_on(
         for k in range(3):
             for j in range(3):
                 stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
-        if stiffness <= 0.0:
+        if stiffness < _MIN_STIFFNESS_N_M:
             return False
         for k in range(3):
             s.advanced[k] -= (size - limit) / stiffness * force[k] / size
