@@ -7,8 +7,10 @@ from cutting_trainer.node_common.kernels import inner
 
 _STEPS = 8
 """Steps in which the way of the tool since a new sample is followed."""
-_MIN_STIFFNESS_N_M = 1e-3
-"""[N/m] below which a force does not fall as the edge goes on."""
+_MAX_DEEPER = 2.0
+"""Factor by which the blade may be longer in the tissue than at the newest sample."""
+_MIN_SHARE = 0.05
+"""Share of the whole stiffness below which a force does not fall as the edge goes on."""
 _MIN_SINE = 0.1
 """Sine of the angle between force and edge below which it says nothing of the cutting force."""
 
@@ -75,6 +77,7 @@ def pull_blade(
         s.stretch[k] = out[k] * 0.5 * c.length / (c.coupling * length) if length > 0.0 else 0.0
         out[k] *= left
         torque[k] *= left
+    safety.clamp(c.length, s.stretch)
 
 
 @inner
@@ -122,7 +125,7 @@ def _go_on(
     """
     c, s, h = setup[0], state[0], history[0]
     size, limit = safety.norm(force), _largest_force(setup, state, history, length, force)
-    if size <= limit:
+    if size <= limit or length == 0.0:
         return False
     if c.crack_length == 0.0 or not extrapolation.step_ahead(
         force, history, limit, c.crack_length, c.blade_friction, c.length, c.max_stiffness,
@@ -132,14 +135,15 @@ def _go_on(
         for k in range(3):
             for j in range(3):
                 stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
-        if stiffness < _MIN_STIFFNESS_N_M:
+        if stiffness <= _MIN_SHARE * scale * np.sqrt(np.sum(h.stiffness**2)):
             return False
         for k in range(3):
             s.advanced[k] -= (size - limit) / stiffness * force[k] / size
     along, before = 0.0, 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
     for k in range(3):
         along += s.advanced[k] * (s.arms[0, k] - s.arms[1, k]) / c.length
-    s.out = min(max(h.leaving, 1.0) * along / before, 1.0) if before > 0.0 else 0.0
+    left = max(h.leaving, 1.0) * along / before if before > 0.0 else 0.0
+    s.out = min(max(left, 1.0 - _MAX_DEEPER), 1.0)
     return True
 
 
@@ -151,18 +155,22 @@ def _largest_force(
 
     It is J l sin(edge, force) + friction, and that of the tip to going deeper, as in
     `tissue_sim/contact/blade_law.py`. A sample shows how much of the edge has uncut tissue ahead,
-    by the largest force that the edge transmits, or its own force where the blade slips out.
+    by the largest force that the edge transmits, or its own force where the blade slips out. Where
+    a sample has a larger force, spine or flat bear it. Against the spine nothing is cut.
     """
     c, s, h = setup[0], state[0], history[0]
-    most = s.resistance
+    most, shown, towards = s.resistance, safety.norm(h.force[1]), 0.0
+    for k in range(3):
+        towards -= force[k] * s.facing[k]
     if h.leaving > 0.0:
-        most = min(most, safety.norm(h.force[1]))
-    if np.isfinite(c.toughness):
+        most = min(most, shown)
+    if towards >= 0.0 and np.isfinite(c.toughness):
         rubbing = c.blade_friction * length
         cosine = _cosine(h.force[1], h.arms[0] - h.arms[1])
-        cutting = max(most - rubbing, 0.0) / max(np.sqrt(1.0 - cosine**2), _MIN_SINE)
+        cutting = max(most - rubbing, 0.0)
         if c.crack_length == 0.0:
-            cutting = min(cutting, c.toughness * length)
+            cutting /= max(np.sqrt(1.0 - cosine**2), _MIN_SINE)
+            cutting = min(cutting, max(c.toughness * length, shown))
         cosine = _cosine(force, s.arms[0] - s.arms[1])
         most = cutting * np.sqrt(1.0 - cosine**2) + rubbing
         most += c.tip_resistance * max(cosine, 0.0)

@@ -24,6 +24,8 @@ MAX_EXTRAPOLATION = 3.0
 MIN_SAMPLE_DISTANCE_M = 5e-5
 """[m] Samples closer than this differ by encoder noise only: the force is held instead."""
 _MIN_WAY_M = 1e-4
+"""[m] Way out between two samples from which a blade counts as drawn out."""
+_MIN_SHOWN_M = 5e-4
 """[m] Way between two samples of a blade from which they show a stiffness."""
 _MIN_LEAVING, _MAX_LEAVING = 0.3, 2.0
 """Length that leaves the tissue by the way out, from which the blade slips, and at most."""
@@ -415,24 +417,29 @@ def _leaving(history: np.ndarray, arms: np.ndarray, immersed: np.ndarray) -> flo
 
 
 @inner
-def _stiffen(history: np.ndarray) -> None:
+def _stiffen(history: np.ndarray, arms: np.ndarray, immersed: np.ndarray) -> None:
     """Raise the stiffness along the last way to that which the two samples show.
 
     The stiffness of a sample is that of small strains, and tissue stiffens. It is never lowered: a
-    loop with too small a stiffness is not stable.
+    loop with too small a stiffness is not stable. A short way shows how late the tissue answers.
 
     Args:
-        history: two samples of a blade, dtype HISTORY, shape (1,); `stiffness` is changed.
+        history: two samples of a blade, but `arms` of the last, dtype HISTORY, shape (1,);
+            `stiffness` is changed.
+        arms, immersed: of the new sample, as for `push`.
     """
     h = history[0]
-    way, square, shown, known = h.position[1] - h.position[0], 0.0, 0.0, 0.0
-    for i in range(3):
+    way, square, shown, known = np.empty(3), 0.0, 0.0, 0.0
+    for i in range(3):  # of the middle of the part in the tissue
+        tip, root = arms[1, i] - h.arms[1, i], arms[0, i] - h.arms[0, i]
+        way[i] = h.position[1, i] - h.position[0, i] + tip + immersed[0] * (root - tip)
         square += way[i] * way[i]
         shown -= way[i] * (h.force[1, i] - h.force[0, i])
+    for i in range(3):
         for j in range(3):
             known += way[i] * h.stiffness[i, j] * way[j]
     more = min(shown, _MAX_STIFFNESS_RATIO * known) - known
-    if square < _MIN_WAY_M**2 or more <= 0.0:
+    if square < _MIN_SHOWN_M**2 or more <= 0.0:
         return
     for i in range(3):
         for j in range(3):
@@ -457,11 +464,11 @@ def _push(
         h.position[1, k], h.force[1, k], h.torque[1, k] = position[k], force[k], torque[k]
         h.depth[k] = depth[k]
     if np.any(stiffness):
-        h.stiffness[:] = stiffness
+        h.stiffness[:] = 0.5 * (stiffness + stiffness.T) if immersed[1] > 0.0 else stiffness
     of_blade = h.count == 2 and immersed[1] > 0.0
     h.leaving = _leaving(history, arms, immersed) if of_blade else 0.0
-    if of_blade and h.leaving == 0.0:
-        _stiffen(history)
+    if of_blade and h.leaving == 0.0 and np.any(stiffness):
+        _stiffen(history, arms, immersed)
     h.arms[:] = arms
     h.immersed[:] = immersed
     h.topology = topology

@@ -32,9 +32,6 @@ _PASSIVITY_RECOVERY_S = 0.02
 _UNKNOWN_TISSUE_SHARE = 0.1
 """Largest share of the device's force for a tissue of unknown stiffness."""
 
-_MAX_DEEPER = 2.0
-"""Factor by which the blade may be longer in the tissue than at the newest sample."""
-
 MAX_SLEW_PERIOD_S = 0.005
 """[s] Longest period that the slew limit allows for: a late tick catches up no further."""
 
@@ -304,7 +301,7 @@ def _tissue_force(
     else:
         # The blade transmits at most the cutting resistance: zero while no part is in tissue.
         # It may exceed the last bound only by the stretch of its spring since then.
-        share = s.reach * min(1.0 - s.out, _MAX_DEEPER)
+        share = s.reach * (1.0 - s.out)
         safety.clamp(min(share * s.resistance, s.held), out)
         safety.clamp(min(share * s.torque_resistance, s.held * c.length), torque)
         torque[0] += s.arms[1, 1] * out[2] - s.arms[1, 2] * out[1]

@@ -21,23 +21,23 @@ LOAD = 1.2
 TOOL = ToolSettings(
     radius=RADIUS, coupling_stiffness=200.0, blade_root=(0, 0, 0.008), blade_tip=(0, 0, -0.012)
 )
-UNCHARTED = (5001, 5012)
+UNCHARTED = (5002, 5012)
 """Seeds of strokes that no chart has."""
 
 
-def loaded(load: float) -> Rig:
+def loaded(load: float, tool: ToolSettings = TOOL, **changes: tuple[float, ...]) -> Rig:
     """A rig whose blade is in the tissue and has a load across it [N]; no sample follows."""
-    rig = Rig(tool=TOOL, constants=BladeConstants(friction=FRICTION, toughness=TOUGHNESS))
+    rig = Rig(tool=tool, constants=BladeConstants(friction=FRICTION, toughness=TOUGHNESS))
     rig.run(lowered(4e-3, 300))
     rig.inside = True
     mean = IMMERSED / LENGTH / 2
-    rig.spoil = lambda sample: spoiled(
-        sample,
-        force=(-load, 0.0, 0.0),
-        stiffness=tuple(STIFFNESS * np.eye(3).ravel()),
-        resistance=((TOUGHNESS + FRICTION) * IMMERSED,),
-        immersed=(mean, mean**2 * 4 / 3),
-    )
+    values = {
+        'force': (-load, 0.0, 0.0),
+        'stiffness': tuple(STIFFNESS * np.eye(3).ravel()),
+        'resistance': ((TOUGHNESS + FRICTION) * IMMERSED,),
+        'immersed': (mean, mean**2 * 4 / 3),
+    }
+    rig.spoil = lambda sample: spoiled(sample, **values | changes)
     rig.run(np.full(2 * FRAME, DEEP))
     for x in np.append(np.linspace(0.0, ASIDE, FRAME), np.full(2 * FRAME, ASIDE)):
         rig.tick((float(x), 0.0, DEEP))
@@ -89,12 +89,35 @@ def test_tissue_that_two_samples_show_to_be_stiffer_is_felt_so_from_then_on() ->
     np.testing.assert_allclose(np.diff(forces), -shown * 1e-4, rtol=0.05)
 
 
+@pytest.mark.parametrize('facing', [(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
+def test_spine_and_flat_are_felt_as_the_tissue_bears_them_beyond_what_cuts(
+    facing: tuple[float, float, float],
+) -> None:
+    tool = TOOL.model_copy(update={'blade_facing': facing})
+    rig = loaded(1.5 * TOUGHNESS * IMMERSED, tool, resistance=(3.0,))
+    forces = drawn(rig, np.zeros(20))
+    assert forces[-1, 0] == pytest.approx(-1.5 * TOUGHNESS * IMMERSED, rel=0.01)
+
+
+def test_a_blade_goes_on_by_no_more_than_finite_ways_in_a_forged_tissue() -> None:
+    turned = np.array([[0.0, 200.0, 0.0], [-200.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    stiffness = tuple((turned + 2e-3 * np.eye(3)).ravel())
+    rig = loaded(LOAD, stiffness=stiffness, resistance=(0.0,))
+    rig.sim = True
+    for i in range(300):
+        waves = np.sin(np.array([i / 30, i / 7, i / 11]))
+        x, y, z = waves * (ASIDE, 2e-3, 4e-3) + (0.0, 0.0, DEEP)
+        rig.tick((float(x), float(y), float(z)))
+    assert not any(tick.fault for tick in rig.ticks)
+
+
 @pytest.mark.long
 @pytest.mark.thorough
 @pytest.mark.parametrize('seed', UNCHARTED)
 def test_a_blade_that_slices_and_is_withdrawn_feels_as_over_a_tissue_at_1_khz(seed: int) -> None:
     errors = errors_of(seed)
     assert errors.peak > 1.0
-    assert errors.p95 < 0.08
+    assert errors.p95 < 0.065
+    assert errors.worst < 0.25
     assert errors.hole < 0.2
     assert errors.tail < 0.005
