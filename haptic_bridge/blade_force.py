@@ -49,12 +49,7 @@ def hold(setup: np.ndarray, state: np.ndarray, history: np.ndarray, out: np.ndar
 
 @inner
 def pull_blade(
-    setup: np.ndarray,
-    state: np.ndarray,
-    history: np.ndarray,
-    time: int,
-    out: np.ndarray,
-    torque: np.ndarray,
+    setup: np.ndarray, state: np.ndarray, history: np.ndarray, out: np.ndarray, torque: np.ndarray
 ) -> None:
     """Compute force and torque of a blade by the stiffness at its newest sample.
 
@@ -68,9 +63,9 @@ def pull_blade(
     steps = _STEPS if s.renewed else 1
     s.renewed = False
     for step in range(1, steps + 1):
-        _force_after(setup, state, history, time, step / steps, out, torque)
+        _force_after(setup, state, history, step / steps, out, torque)
         if _go_on(setup, state, history, length, out):
-            _force_after(setup, state, history, time, step / steps, out, torque)
+            _force_after(setup, state, history, step / steps, out, torque)
     left = min(1.0 - s.out, 1.0)
     for k in range(3):
         # The coupling is as stiff as its scene says where half of the blade is in the tissue.
@@ -85,19 +80,15 @@ def _force_after(
     setup: np.ndarray,
     state: np.ndarray,
     history: np.ndarray,
-    time: int,
     share: float,
     out: np.ndarray,
     torque: np.ndarray,
 ) -> None:
     """Compute force and torque on all that was in the tissue, after a share of the tool's way."""
-    c, s, h = setup[0], state[0], history[0]
-    none, at = np.zeros(3), np.empty(3)
+    s, h, at = state[0], history[0], np.empty(3)
     for k in range(3):
         at[k] = h.position[1, k] + share * (s.tip[k] - h.position[1, k]) - s.advanced[k]
-    extrapolation.estimate(
-        c.law, history, time, at, none, False, s.arms, c.max_stiffness, out, torque
-    )
+    extrapolation.local_blade(at, s.arms, history, setup[0].max_stiffness, out, torque)
 
 
 @inner
@@ -116,7 +107,9 @@ def _go_on(
 ) -> bool:
     """Let the edge go on where its force exceeds the resistance; return whether it did.
 
-    Where a crack runs in steps, a sample has those up to its own time; since then, they are here.
+    Where a crack runs in steps, a sample has those up to its own time; since then, they are here: a
+    step lowers the force by k a (`tissue_sim/contact/crack.py`), and by no more than its part above
+    friction.
 
     Args:
         setup, state, history: see `force_kernels`; `advanced` and `out` are changed.
@@ -127,20 +120,18 @@ def _go_on(
     size, limit = safety.norm(force), _largest_force(setup, state, history, length, force)
     if size <= limit or length == 0.0:
         return False
-    if c.crack_length == 0.0 or not extrapolation.step_ahead(
-        force, history, limit, c.crack_length, c.blade_friction, c.length, c.max_stiffness,
-        s.advanced,
-    ):  # fmt: skip
-        scale, stiffness = extrapolation.rendered_share(h.stiffness, c.max_stiffness), 0.0
-        for k in range(3):
-            for j in range(3):
-                stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
-        if stiffness <= _MIN_SHARE * scale * np.sqrt(np.sum(h.stiffness**2)):
-            return False
-        for k in range(3):
-            s.advanced[k] -= (size - limit) / stiffness * force[k] / size
+    scale, stiffness = extrapolation.rendered_share(h.stiffness, c.max_stiffness), 0.0
+    for k in range(3):
+        for j in range(3):
+            stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
+    if stiffness <= _MIN_SHARE * scale * np.sqrt(np.sum(h.stiffness**2)):
+        return False
+    drop, step = size - limit, min(stiffness * c.crack_length, limit - c.blade_friction * length)
+    if step > 0.0:
+        drop = np.ceil(drop / step) * step
     along, before = 0.0, 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
     for k in range(3):
+        s.advanced[k] -= drop / stiffness * force[k] / size
         along += s.advanced[k] * (s.arms[0, k] - s.arms[1, k]) / c.length
     left = max(h.leaving, 1.0) * along / before if before > 0.0 else 0.0
     s.out = min(max(left, 1.0 - _MAX_DEEPER), 1.0)

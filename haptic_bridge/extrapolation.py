@@ -182,56 +182,6 @@ def local_blade(
 
 
 @inner
-def step_ahead(
-    force: np.ndarray,
-    history: np.ndarray,
-    limit: float,
-    crack_length: float,
-    friction: float,
-    length: float,
-    max_stiffness: float,
-    advanced: np.ndarray,
-) -> bool:
-    """Let the edge go on by whole steps of a crack where its force exceeds the limit.
-
-    A step lowers the force by k a (`tissue_sim/contact/crack.py`), and by no more than its part
-    above friction: so it is in `tissue_sim`, where the limit is half of that above the mean.
-
-    Args:
-        force: F of `local_blade` [N], shape (3,).
-        history: dtype HISTORY, shape (1,).
-        limit: largest force of the blade [N].
-        crack_length: a of a step [m].
-        friction: by length of the blade [N/m].
-        length: of the blade [m].
-        max_stiffness: [N/m].
-        advanced: way of the edge since the newest sample [m]; changed, shape (3,).
-
-    Returns:
-        Whether it went on.
-    """
-    h = history[0]
-    size = np.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
-    if size <= limit:
-        return False
-    scale = rendered_share(h.stiffness, max_stiffness)
-    stiffness = 0.0
-    for k in range(3):
-        for j in range(3):
-            stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
-    # Places along the blade from s to s + b: their variance is b^2 / 12.
-    spread = max(h.immersed[1] - h.immersed[0] ** 2, 0.0)
-    cutting = limit - friction * length * np.sqrt(12.0 * spread)
-    drop = min(stiffness * crack_length, cutting)
-    if drop <= 0.0:
-        return False
-    way = np.ceil((size - limit) / drop) * drop / stiffness
-    for k in range(3):
-        advanced[k] -= way * force[k] / size
-    return True
-
-
-@inner
 def stiffness_along_path(
     stiffness: np.ndarray,
     depth: np.ndarray,
@@ -463,11 +413,12 @@ def _push(
         )
         h.position[1, k], h.force[1, k], h.torque[1, k] = position[k], force[k], torque[k]
         h.depth[k] = depth[k]
-    if np.any(stiffness):
+    given = np.any(stiffness)
+    if given:
         h.stiffness[:] = 0.5 * (stiffness + stiffness.T) if immersed[1] > 0.0 else stiffness
     of_blade = h.count == 2 and immersed[1] > 0.0
     h.leaving = _leaving(history, arms, immersed) if of_blade else 0.0
-    if of_blade and h.leaving == 0.0 and np.any(stiffness):
+    if of_blade and h.leaving == 0.0 and given:
         _stiffen(history, arms, immersed)
     h.arms[:] = arms
     h.immersed[:] = immersed

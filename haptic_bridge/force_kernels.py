@@ -279,7 +279,7 @@ def _tissue_force(
         depth = s.proxy - s.tip
         touching = contact == TOUCHING
         if c.law == extrapolation.LOCAL_STIFFNESS and not touching:
-            blade_force.pull_blade(setup, state, history, time, out, torque)
+            blade_force.pull_blade(setup, state, history, out, torque)
         else:
             extrapolation.estimate(
                 c.law, history, time, s.tip, depth, touching, s.arms, c.max_stiffness, out, torque
