@@ -34,6 +34,7 @@ WORK: dict[str, Work] = {
     ARM_NODE: 'force loop',
     BRIDGE_NODE: 'force loop',
     TISSUE_NODE: 'frames',
+    RECORDER_NODE: 'messages',
 }
 """Nodes that may get processors of their own."""
 SHARED = (

@@ -1,19 +1,25 @@
 """Processors of a session: force loops on some, the frames of the tissue on the others.
 
-A loop of 1 kHz that wakes on the processor of a frame stops it, even while another processor has
-nothing to do. On two processors frames then took half as long again (docs/architecture.md).
+What wakes at 1 kHz on the processor of a frame stops it, even while another processor has nothing
+to do: a loop, and a thread that receives the messages of one. On two processors frames then took
+half as long again (docs/architecture.md). A loop also sends in less time to a thread of its own
+processor than to one that sleeps on another.
 """
 
 import os
 import socket
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Literal
 
-Work = Literal['force loop', 'frames', 'other']
-"""Work of a node: a loop of 1 kHz, the frames of the tissue, or what may run anywhere."""
+Work = Literal['force loop', 'messages', 'frames', 'other']
+"""Work of a node: a loop of 1 kHz, the messages of such loops, the frames of the tissue, or what
+may run anywhere."""
 LOOPS_PER_PROCESSOR = 2
 """Force loops that share a processor: those of an arm and its bridge."""
+_RECEIVES = 'dds.'
+"""How the names of the threads begin in which DDS receives."""
 _ADDRESS = '\0cutting_trainer.processors'
 
 
@@ -27,7 +33,22 @@ def shared_out(work: Sequence[Work], processors: Sequence[int]) -> dict[Work, se
     count = -(-work.count('force loop') // LOOPS_PER_PROCESSOR)
     if 'frames' not in work or not 0 < count < len(processors):
         return {}
-    return {'frames': set(processors[:-count]), 'force loop': set(processors[-count:])}
+    loops = set(processors[-count:])
+    return {'frames': set(processors[:-count]), 'force loop': loops, 'messages': loops}
+
+
+def place(pid: int, processors: set[int]) -> None:
+    """Put a process that has only just started on some processors."""
+    with suppress(ProcessLookupError):  # it has just ended
+        os.sched_setaffinity(pid, processors)
+
+
+def place_receivers(pid: int, processors: set[int]) -> None:
+    """Put those threads of a process on some processors in which DDS receives."""
+    with suppress(OSError):  # the process or a thread has just ended
+        for thread in Path(f'/proc/{pid}/task').iterdir():
+            if (thread / 'comm').read_text().startswith(_RECEIVES):
+                os.sched_setaffinity(int(thread.name), processors)
 
 
 @contextmanager

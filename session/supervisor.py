@@ -1,12 +1,11 @@
 """Start, supervise and end the nodes of a session; nothing is left running."""
 
-import os
 import selectors
 import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +20,7 @@ from cutting_trainer.session.node_process import (
     unready_sentence,
 )
 from cutting_trainer.session.outcome import Death, Outcome, describe
-from cutting_trainer.session.processors import Work, reserved_processors
+from cutting_trainer.session.processors import Work, place, place_receivers, reserved_processors
 from cutting_trainer.session.restart_backoff import Backoff
 
 STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -258,8 +257,7 @@ class Supervisor:
             command, self._logs / f'{command.name.replace("/", ".")}.log', self._environment
         )
         if command.work in self._processors:
-            with suppress(ProcessLookupError):  # it has just ended
-                os.sched_setaffinity(node.process.pid, self._processors[command.work])
+            place(node.process.pid, self._processors[command.work])
         self._nodes[command.name] = node
         self._selector.register(node.pipe, selectors.EVENT_READ, node)
 
@@ -337,6 +335,8 @@ class Supervisor:
             return
         if line == f'ready: {node.name}':
             node.ready, node.beat = True, self._lived
+            if node.command.work in self._processors:
+                place_receivers(node.process.pid, self._processors['messages'])
             self._emit(Event('ready', node.name, line))
         elif line == f'done: {node.name}':
             node.done = True

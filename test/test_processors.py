@@ -1,6 +1,7 @@
 """Force loops and frames get processors of their own, where there are enough."""
 
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +12,26 @@ from test_supervisor import ENVIRONMENT, Ledger, command
 
 from cutting_trainer.session import processors
 from cutting_trainer.session.node_commands import session_nodes
+from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.processors import Work, reserved_processors, shared_out
 from cutting_trainer.session.supervisor import Supervisor
 
-SESSION: list[Work] = ['force loop', 'force loop', 'frames', 'other', 'other']
+SESSION: list[Work] = ['force loop', 'force loop', 'frames', 'messages', 'other']
+RECEIVES = """
+import ctypes, sys, threading, time
+
+def receive():
+    ctypes.CDLL(None).prctl(15, b'dds.udp.7411', 0, 0, 0)
+    named.set()
+    time.sleep(60.0)
+
+named = threading.Event()
+threading.Thread(target=receive, daemon=True).start()
+named.wait()
+print('ready: ' + sys.argv[1], flush=True)
+time.sleep(60.0)
+"""
+"""A node with a thread whose name is that of one in which DDS receives."""
 
 
 @pytest.fixture
@@ -35,7 +52,8 @@ def own_address(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_force_loops_share_a_processor_and_frames_get_the_others(
     work: list[Work], available: list[int], loops: set[int], frames: set[int]
 ) -> None:
-    assert shared_out(work, available) == {'force loop': loops, 'frames': frames}
+    expected = {'force loop': loops, 'messages': loops, 'frames': frames}
+    assert shared_out(work, available) == expected
 
 
 @given(st.lists(st.sampled_from(SESSION), max_size=9), st.sets(st.integers(0, 63), min_size=1))
@@ -53,13 +71,14 @@ def test_no_processor_has_both_and_each_kind_has_one_or_nothing_is_shared_out(
         assert missing or work.count('force loop') > 2 * (len(available) - 1)
 
 
-def test_arms_and_bridges_have_force_loops_and_the_tissue_has_frames() -> None:
+def test_each_node_has_the_work_that_it_does() -> None:
     nodes = session_nodes(Path('scene'), Path('bag'), 0, 1.0, ['grasper'])
     work = {node.name: node.work for node in nodes}
     loops = {name for name, kind in work.items() if kind == 'force loop'}
     arms = {'emulated_arm', 'haptic_bridge'}
     assert loops == arms | {f'grasper/{name}' for name in arms}
     assert [name for name, kind in work.items() if kind == 'frames'] == ['tissue_sim']
+    assert [name for name, kind in work.items() if kind == 'messages'] == ['recorder']
 
 
 @pytest.mark.usefixtures('own_address')
@@ -83,3 +102,25 @@ def test_nodes_run_on_the_processors_of_their_work(tmp_path: Path) -> None:
         for name, pid in supervisor.pids.items():
             own = expected.get(kinds[name], all_of_them)
             assert os.sched_getaffinity(pid) == own
+
+
+def threads(pid: int) -> dict[str, set[int]]:
+    """Return the processors of the threads of a process, by the name of the thread."""
+    folders = Path(f'/proc/{pid}/task').iterdir()
+    return {(f / 'comm').read_text().strip(): os.sched_getaffinity(int(f.name)) for f in folders}
+
+
+@pytest.mark.usefixtures('own_address')
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason='there is one processor')
+def test_what_receives_messages_of_force_loops_is_on_their_processor(tmp_path: Path) -> None:
+    kinds: dict[str, Work] = {'arm': 'force loop', 'tissue': 'frames', 'cutting': 'other'}
+    argv = (sys.executable, '-S', '-c', RECEIVES)
+    nodes = [NodeCommand(name, (*argv, name), work=kind) for name, kind in kinds.items()]
+    expected = shared_out([*kinds.values()], sorted(os.sched_getaffinity(0)))
+    with Supervisor(nodes, tmp_path / 'log', ENVIRONMENT) as supervisor:
+        assert supervisor.start()
+        found = {name: threads(pid) for name, pid in supervisor.pids.items()}
+    receivers = {name: by_thread.pop('dds.udp.7411') for name, by_thread in found.items()}
+    assert receivers['arm'] == receivers['tissue'] == expected['force loop']
+    assert [*found['tissue'].values()] == [expected['frames']]
+    assert receivers['cutting'] == os.sched_getaffinity(0)
