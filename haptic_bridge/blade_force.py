@@ -4,7 +4,9 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, safety
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
+_SCALPEL = ToolMode.SCALPEL.value
 _STEPS = 8
 """Steps in which the way of the tool since a new sample is followed."""
 _MAX_DEEPER = 2.0
@@ -24,7 +26,7 @@ def enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> N
     to there.
     """
     c, s = setup[0], state[0]
-    if not s.enters:
+    if s.mode != _SCALPEL:
         return
     if s.entered == 0 and safety.norm(out) >= max(c.entry_force, s.borne):
         s.entered = time

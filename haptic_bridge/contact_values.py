@@ -4,8 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy.kernels import STATE
-from cutting_trainer.haptic_bridge.proxy.proxy import Touch
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.node_common.kernels import inner
@@ -26,8 +24,6 @@ CONTACT = record_type(
     ]
 )
 """Fields of `Contact` from the nodes on; all of 8 bytes."""
-NOWHERE = Touch(np.zeros(1, STATE))
-"""Touch of a proxy that is not used."""
 
 
 class Tick(NamedTuple):
@@ -92,15 +88,16 @@ class ContactReport:
 
 
 @inner
-def pack(state: np.ndarray, touch: np.ndarray, touched: bool, contact: np.ndarray) -> None:
-    """Write tool and touch to a contact; where the proxy is not used, its point is zero."""
-    s, t, c = state[0], touch[0], contact[0]
+def pack(state: np.ndarray, proxy: np.ndarray, used: bool, contact: np.ndarray) -> None:
+    """Write tool and touch to a contact; of a proxy that is not used, all is zero."""
+    s, t, c = state[0], proxy[0], contact[0]
     for k in range(9):
-        c.nodes[k], c.weights[k] = max(t.nodes[k], 0), t.weights[k]
+        c.nodes[k] = max(t.nodes[k], 0) if used else 0
+        c.weights[k] = t.weights[k] if used else 0.0
     for k in range(3):
         c.device[k], c.external_force[k] = s.tip[k], s.external[k]
         c.proxy[k] = s.tip[k] - s.external[k] / c.coupling_stiffness
-        c.point[k] = c.proxy[k] + (t.contact[k] - t.position[k]) if touched else 0.0
-        c.normal[k] = t.normal[k]
+        c.point[k] = c.proxy[k] + (t.contact[k] - t.position[k]) if used else 0.0
+        c.normal[k] = t.normal[k] if used else 0.0
         c.blade[0, k], c.blade[1, k] = s.blade[0, k], s.blade[1, k]
         c.blade_facing[k] = s.facing[k]

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from cutting_trainer.haptic_bridge import blade_force, extrapolation, safety
-from cutting_trainer.haptic_bridge.contact_values import pack
 from cutting_trainer.haptic_bridge.devices.motion_gate import judge
 from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.proxy import friction
@@ -19,9 +18,12 @@ from cutting_trainer.haptic_bridge.scene_schema import (
 )
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE, BladeConstants
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
 NONE, TOUCHING, INSIDE = range(3)
 """Contact states, as in `Contact`."""
+GRASPERS = (ToolMode.OPEN_GRASPER.value, ToolMode.CLOSED_GRASPER.value)
+"""Modes of a tool whose jaws hold the tissue."""
 
 _VELOCITY_FILTER_S = 0.005
 """[s] time constant of the low-pass on the damped velocity: encoder steps are coarse at 1 kHz."""
@@ -35,6 +37,10 @@ _UNKNOWN_TISSUE_SHARE = 0.1
 MAX_SLEW_PERIOD_S = 0.005
 """[s] Longest period that the slew limit allows for: a late tick catches up no further."""
 
+ENERGY_CREDIT_J = 2e-4
+"""[J] Energy that the force loop may have generated before the passivity controller acts: a fifth
+of the energy of a 5 mm indentation of liver. Encoder steps and extrapolation errors lie below."""
+
 SETUP = record_type(
     [
         ('rotation', 'f8', (3, 3)),  # device frame to tissue frame
@@ -45,6 +51,7 @@ SETUP = record_type(
         ('force_scale', 'f8'),
         ('blade', 'f8', (2, 3)),  # root and tip [m], tool frame
         ('facing', 'f8', (3,)),  # of its edge, tool frame; zero: all round
+        ('radius', 'f8'),  # [m] of the tool
         ('coupling', 'f8'),  # [N/m]
         ('law', 'i8'),
         ('one_force', 'b1'),
@@ -54,6 +61,9 @@ SETUP = record_type(
         ('max_damping', 'f8'),  # [N s/m]
         ('max_force', 'f8'),  # [N]
         ('max_slew', 'f8'),  # [N/s]
+        ('stale_after', 'f8'),  # [s]
+        ('fade', 'f8'),  # [s]
+        ('soft_start', 'f8'),  # [s]
         ('length', 'f8'),  # [m] of the blade, in the tissue
         ('crack_length', 'f8'),  # [m] of a step of the crack; 0: it runs steadily
         ('blade_friction', 'f8'),  # [N/m]
@@ -85,8 +95,6 @@ STATE = record_type(
         ('held', 'f8'),  # [N] largest force that can hold the blade
         ('reach', 'f8'),  # share of the resistance that a blade so far from the surface may feel
         ('edge', 'f8', (2, 3)),  # [m] the blade of the last tick
-        ('grips', 'f8'),  # 1: what holds the tissue are jaws, not a blade
-        ('enters', 'b1'),  # whether the tool may go into the tissue
         ('entered', 'i8'),  # [ns] pose by which it has, before the tissue says so; 0: it has not
         ('borne', 'f8'),  # [N] that this contact bore although the blade was to go in
         ('out', 'f8'),  # share of the length in the tissue that has left it since the newest sample
@@ -99,6 +107,22 @@ STATE = record_type(
         ('force', 'f8', (3,)),  # [N] commanded, device base frame
         ('torque', 'f8', (3,)),  # [N m] commanded, about the tip, device base frame
         ('wrench', 'f8', (6,)),  # [N, N m] the same in the frame that the device expects
+        ('max_norm', 'f8'),  # [N] largest norm commanded
+        ('contact', 'i8'),  # NONE, TOUCHING or INSIDE
+        ('contact_time', 'f8'),  # [s] in all
+        ('sequence', 'i8'),  # number of the tick
+        ('began', 'i8'),  # sequence of the tick in which the contact began
+        ('left', 'i8'),  # sequence of the tick in which the last one ended
+        ('touched_ns', 'i8'),  # [ns] time of the last touch; 0: none
+        ('now_ns', 'i8'),  # [ns] time of the last tick
+        ('start_ns', 'i8'),  # [ns] time since which force rises
+        ('sample_ns', 'i8'),  # [ns] arrival of the newest sample; 0: none
+        ('current_ns', 'i8'),  # [ns] last tick whose surface was as new as the sample; 0: none
+        ('says_inside', 'b1'),  # whether that sample says that the blade is in the tissue
+        ('stale', 'b1'),  # whether samples or surface are too old, while force is wanted
+        ('stale_trips', 'i8'),  # how often they became so
+        ('mode', 'i8'),  # of the tool, one of `ToolMode`
+        ('next_mode', 'i8'),  # that it takes once no blade is in the tissue
     ]
 )
 
@@ -126,7 +150,7 @@ def make_setup(
     setup['force_scale'] = haptics.force_scale
     setup['blade'] = (tool.blade_root, tool.blade_tip)
     setup['facing'] = tool.facing()
-    setup['coupling'] = tool.coupling_stiffness
+    setup['radius'], setup['coupling'] = tool.radius, tool.coupling_stiffness
     setup['law'] = extrapolation.LAWS[haptics.extrapolation]
     setup['one_force'] = haptics.forces == 'one'
     # The tissue is felt through the coupling spring: no steeper slope is real.
@@ -138,6 +162,11 @@ def make_setup(
     setup['max_damping'] = haptics.max_damping
     setup['max_force'] = profile.max_force
     setup['max_slew'] = profile.max_slew
+    setup[['stale_after', 'fade', 'soft_start']] = (
+        haptics.stale_after,
+        haptics.fade,
+        haptics.soft_start,
+    )
     length = math.dist(tool.blade_root, tool.blade_tip)
     setup['length'], setup['max_torque'] = length, profile.max_torque
     setup['hand_length'] = length / frame.scale if profile.max_torque > 0.0 else 0.0
@@ -272,7 +301,7 @@ def _tissue_force(
         s.entered, s.borne = 0, 0.0
     if contact == NONE:
         return
-    if contact == INSIDE and s.grips > 0.0:
+    if contact == INSIDE and s.mode in GRASPERS:
         blade_force.hold(setup, state, history, out)
         return
     if h.count > 0 and not (c.one_force and contact == TOUCHING):
@@ -340,56 +369,7 @@ def _follow_edge(setup: np.ndarray, state: np.ndarray) -> None:
 
 
 @inner
-def _place_proxy(state: np.ndarray, touch: np.ndarray, used: bool, contact: int) -> None:
-    """Write the place of the proxy; one with friction is less its offset: from the tip, its depth
-    leads there. Without a proxy it is the tip.
-    """
-    s, t = state[0], touch[0]
-    for k in range(3):
-        s.proxy[k] = t.position[k] - s.stick[0].offset[k] if used else s.tip[k]
-        if used and contact == TOUCHING:
-            s.normal[k] = t.normal[k]
-
-
-@kernel(nogil=True)
-def finish(
-    setup: np.ndarray,
-    state: np.ndarray,
-    history: np.ndarray,
-    touch: np.ndarray,
-    used: bool,
-    report: np.ndarray,
-    depth: np.ndarray,
-    contact: int,
-    enabled: bool,
-    time: int,
-    gain: float,
-    elapsed: float,
-) -> bool:
-    """Compute command and report of a tick whose contact is known: one call from Python.
-
-    Args:
-        setup, state, history, contact, enabled, time, gain, elapsed: as of `_command`.
-        touch: of the proxy, dtype `proxy.kernels.STATE`, shape (1,).
-        used: whether there is a proxy in this tick.
-        report: dtype `contact_values.CONTACT`, shape (1,); written.
-        depth: from the tip to the proxy [m], shape (3,); written where there is one.
-
-    Returns:
-        False where the result was not finite; force and torque are then zero.
-    """
-    s = state[0]
-    _place_proxy(state, touch, used, contact)
-    if used:
-        for k in range(3):
-            depth[k] = s.proxy[k] - s.tip[k]
-    finite = _command(setup, state, history, contact, enabled, time, gain, elapsed)
-    pack(state, touch, used, report)
-    return finite
-
-
-@inner
-def _command(
+def command(
     setup: np.ndarray,
     state: np.ndarray,
     history: np.ndarray,

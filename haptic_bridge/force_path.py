@@ -13,14 +13,24 @@ from typing import Any
 import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, force_kernels, safety
-from cutting_trainer.haptic_bridge.contact_plausibility import MAX_STEP_AHEAD, ContactPlausibility
-from cutting_trainer.haptic_bridge.contact_values import NOWHERE, ContactReport, Tick
+from cutting_trainer.haptic_bridge.contact_plausibility import (
+    MAX_STEP_AHEAD,
+    WORK,
+    bounded_stiffness,
+)
+from cutting_trainer.haptic_bridge.contact_values import ContactReport, Tick
 from cutting_trainer.haptic_bridge.devices.motion_gate import GATE
-from cutting_trainer.haptic_bridge.force_kernels import INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.force_kernels import ENERGY_CREDIT_J, INSIDE, NONE, TOUCHING
+from cutting_trainer.haptic_bridge.force_tick import (
+    is_plausible_alone,
+    leave_contact_alone,
+    tick,
+)
 from cutting_trainer.haptic_bridge.hand_coupling import HandCoupling
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import surface_stiffness
-from cutting_trainer.haptic_bridge.proxy.friction import make_proxy, split_stiffness
-from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.friction import make_stick, split_stiffness
+from cutting_trainer.haptic_bridge.proxy.proxy import NO_WAY, Proxy
+from cutting_trainer.haptic_bridge.proxy.surface import NO_GEOMETRY, Surface
 from cutting_trainer.haptic_bridge.proxy.undented_surface import UndentedSurface
 from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceProfile,
@@ -45,9 +55,6 @@ _BORNE_RATIO = 1.5
 """Factor by which the entry force is exceeded before the same contact lets the blade in again."""
 _MAX_PENDING_CONTACTS = 4096
 """Contacts whose answer may still arrive."""
-ENERGY_CREDIT_J = 2e-4
-"""[J] Energy that the force loop may have generated before the passivity controller acts: a fifth
-of the energy of a 5 mm indentation of liver. Encoder steps and extrapolation errors lie below."""
 POSE, FORCE = 'arm/measured_cp', 'tissue/force'
 _INVALID = MessageError('marked invalid', 'its stamp is 0')
 _OUTDATED = MessageError('not newer than the one before')
@@ -66,19 +73,14 @@ class ForcePath:
     Args:
         tool, device, haptics: sections of the scene.
         profile: limits of the device.
-        refusals: rejection statistics to count in; None: its own.
+        rejections: statistics to count in; None: its own.
         edge_resistance: largest cutting resistance of the tissue by blade length [N/m].
         friction: of the tool on the tissue.
         constants: of the blade in this tissue.
         number: of the tool, by its place in the list of the scene.
 
     Attributes:
-        stale_trips: how often the simulation's data went stale while enabled.
-        refusals: statistics of rejected messages: repeated, out of order, marked invalid.
-        contact_time: total [s].
-        max_force: largest norm commanded [N].
-        mode: of the tool, as it is reported.
-        next_mode: mode that it takes once no blade is in the tissue.
+        rejections: statistics of rejected messages: repeated, out of order, marked invalid.
         coupling: of hand and tool, which may be changed.
 
     Raises:
@@ -97,20 +99,13 @@ class ForcePath:
         constants: BladeConstants = UNKNOWN_BLADE,
         number: int = 0,
     ) -> None:
-        self.stale_trips = 0
         self.rejections = rejections or RejectionStatistics()
-        self.contact_time = 0.0
-        self.max_force = 0.0
-        self.mode = self.next_mode = ToolMode[tool.mode.upper()]
         self.coupling = HandCoupling(tool, device, haptics, profile, constants)
         self._state = np.zeros(1, force_kernels.STATE)
         self._s: Any = self._state[0]
-        names = ('force', 'wrench', 'tip', 'blade', 'arms')
-        self._take_mode(self.mode)
-        self._force, self._wrench, self._tip, self._blade, self._arms = map(
-            self._s.__getitem__, names
-        )
-        self._plausibility = ContactPlausibility(tool, tool.coupling_stiffness)
+        self._s['mode'] = self._s['next_mode'] = ToolMode[tool.mode.upper()]
+        names = ('force', 'wrench', 'tip', 'arms')
+        self._force, self._wrench, self._tip, self._arms = map(self._s.__getitem__, names)
         self._length = math.dist(tool.blade_root, tool.blade_tip)
         if any(tool.blade_facing):  # spine and flat do not cut: they stretch the coupling
             edge_resistance = max(edge_resistance, tool.coupling_stiffness)
@@ -118,27 +113,51 @@ class ForcePath:
         self._max_resistance += tool.coupling_stiffness * constants.crack_length / 2
         self._history = np.zeros(1, extrapolation.HISTORY)
         self._grips = friction.sliding > 0.0
-        self._proxy = make_proxy(tool.radius, self._s['stick'], friction)
+        self._s['stick'] = make_stick(friction)
+        self._proxy = Proxy(tool.radius, self._s['stick'])
+        self._work = np.zeros(1, WORK)
         self._stiffness = tool.coupling_stiffness
+        self._stiffness_ns: int | None = None
         self._number = number
         self._report = ContactReport(tool.coupling_stiffness, tool.radius, number)
         self._pose = np.zeros(7)
         self._gate = np.zeros(1, GATE)
         self._pose_stamp = self._pose_ns = 0
-        self._sample_ns = self._current_ns = self._start_ns = self._last_ns = 0
         self._step = self._sample_revision = -1
-        self._sample_state = NONE
         self._undented = UndentedSurface()
-        self._sequence = self._began = self._left = 0
         self._depths = np.zeros((_MAX_PENDING_CONTACTS, 3))
         self._past_arms = np.zeros((_MAX_PENDING_CONTACTS, 2, 3))
         self._contact = NONE
-        self._was_enabled = self._stale = False
+        self._was_enabled = False
 
-    def _take_mode(self, mode: ToolMode) -> None:
-        self.mode = mode
-        self._s['grips'] = mode.is_grasper
-        self._s['enters'] = mode is ToolMode.SCALPEL
+    @property
+    def mode(self) -> ToolMode:
+        """Return the mode of the tool, as it is reported."""
+        return ToolMode(self._s['mode'])
+
+    @property
+    def next_mode(self) -> ToolMode:
+        """Return the mode that it takes once no blade is in the tissue."""
+        return ToolMode(self._s['next_mode'])
+
+    @next_mode.setter
+    def next_mode(self, mode: ToolMode) -> None:
+        self._s['next_mode'] = mode
+
+    @property
+    def stale_trips(self) -> int:
+        """Return how often the simulation's data went stale while force was wanted."""
+        return int(self._s['stale_trips'])
+
+    @property
+    def contact_time(self) -> float:
+        """Return the time of contact in all [s]."""
+        return float(self._s['contact_time'])
+
+    @property
+    def max_force(self) -> float:
+        """Return the largest norm commanded [N]."""
+        return float(self._s['max_norm'])
 
     @property
     def haptics(self) -> HapticsSettings:
@@ -153,7 +172,7 @@ class ForcePath:
     @property
     def is_stale(self) -> bool:
         """Return whether the simulation is silent while force is wanted."""
-        return self._stale
+        return bool(self._s['stale'])
 
     @property
     def contact(self) -> int:
@@ -176,7 +195,7 @@ class ForcePath:
 
     def simulation_age(self, now_ns: int) -> float:
         """Return the time since the last force and surface [s]; infinite before the first."""
-        oldest = min(self._sample_ns, self._current_ns)
+        oldest = min(int(self._s['sample_ns']), int(self._s['current_ns']))
         return (now_ns - oldest) * _SECOND if oldest else np.inf
 
     def cause(self, now_ns: int) -> str:
@@ -209,14 +228,11 @@ class ForcePath:
             sample_ns: arrival time of the sample [ns] if it waited in a queue; None: `now_ns`.
             surface: the newest surface of the tissue; None before the first.
         """
-        elapsed = min(
-            max((now_ns - self._last_ns) * _SECOND, 1e-4), force_kernels.MAX_SLEW_PERIOD_S
-        )
-        self._last_ns = now_ns
         enabled = state is CrtkState.ENABLED
         if self.coupling.ordered and self._pose_stamp:
             regained = self.coupling.carry_out(self._state, self._pose_stamp)
-            self._start_ns = now_ns if regained else self._start_ns
+            if regained:
+                self._s['start_ns'] = now_ns
         fault = self._take_pose(now_ns, pose, enabled) or self._take_sample(
             now_ns, sample, now_ns if sample_ns is None else sample_ns, surface
         )
@@ -225,35 +241,57 @@ class ForcePath:
         if enabled and not self._was_enabled:
             self._begin(now_ns)
         self._was_enabled = enabled
-        gain = self._gain(now_ns, enabled)
-        touched = self._touch(now_ns, surface, enabled)
-        if self.mode is not self.next_mode and (self._contact != INSIDE or self.mode.is_grasper):
-            self._take_mode(self.next_mode)
-        if fault or state is CrtkState.FAULT:
-            self._s['force'] = self._s['torque'] = 0.0
-        if not force_kernels.finish(
+        zero = bool(fault) or state is CrtkState.FAULT
+        if not self._compute(now_ns, surface, enabled, zero):
+            fault = fault or 'the commanded force was not finite'
+        mode = self.mode
+        if mode is ToolMode.CLOSED_GRASPER and not enabled:
+            mode = ToolMode.OPEN_GRASPER  # without force, the jaws let go
+        sequence = int(self._s['sequence'])
+        contact = self._report.values(sequence, self._contact, surface, mode)
+        return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
+
+    def _compute(self, now_ns: int, surface: Surface | None, enabled: bool, zero: bool) -> bool:
+        """Compute contact, command and report; return False where they are not finite.
+
+        Args:
+            now_ns: monotonic clock [ns].
+            surface: the newest of the tissue.
+            enabled: whether force is wanted.
+            zero: whether the force goes to zero at once.
+        """
+        undented = self._undented
+        newest, motion, way = NO_GEOMETRY, 0.0, NO_WAY
+        if surface is not None:
+            undented.follow(now_ns, surface)
+            newest, motion = surface.geometry, surface.motion
+            if enabled:
+                assert undented.surface is not None
+                way = self._proxy.way_to(undented.surface, undented.blend(now_ns))
+        self._contact, finite = tick(
             self.coupling.setup,
             self._state,
             self._history,
-            (touched or NOWHERE).state,
-            touched is not None,
+            self._depths,
+            self._past_arms,
             self._report.record,
-            self._depths[self._sequence % _MAX_PENDING_CONTACTS],
-            self._contact,
-            enabled,
+            self._proxy.touch.state,
+            self._work,
+            newest,
+            motion,
+            *way,
+            now_ns,
             self._pose_stamp,
-            gain,
-            elapsed,
-        ):
-            fault = fault or 'the commanded force was not finite'
-        if self._contact != NONE:
-            self.contact_time += elapsed
-        self.max_force = max(self.max_force, self.force_norm)
-        mode = self.mode
-        if mode == ToolMode.CLOSED_GRASPER and not enabled:
-            mode = ToolMode.OPEN_GRASPER  # without force, the jaws let go
-        contact = self._report.values(self._sequence, self._contact, surface, mode)
-        return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
+            enabled,
+            zero,
+            surface is not None,
+            surface is not None and surface.revision >= self._sample_revision,
+        )
+        if self._contact == TOUCHING:
+            undented.freeze()
+        elif self._contact == INSIDE:
+            undented.release()
+        return finite
 
     def _take_pose(self, now_ns: int, pose: StampedMessage | None, enabled: bool) -> str:
         if pose is None:
@@ -280,7 +318,8 @@ class ForcePath:
         if sample is None:
             return ''
         reaction = TissueSample.read(sample)
-        fresh = (now_ns - self._sample_ns) * _SECOND <= self.haptics.stale_after
+        age = (now_ns - int(self._s['sample_ns'])) * _SECOND
+        fresh = age <= self.haptics.stale_after
         if sample.stamp_ns == 0 or (fresh and reaction.step <= self._step):
             self.rejections.add(FORCE, _OUTDATED if sample.stamp_ns else _INVALID)
             return ''
@@ -294,7 +333,7 @@ class ForcePath:
         if fresh and reaction.step > self._step + MAX_STEP_AHEAD:
             self.rejections.add(FORCE, _AHEAD)
             return ''
-        if reaction.state == INSIDE and not self._accepts_inside(now_ns, surface):
+        if reaction.state == INSIDE and not self._is_plausible(now_ns, surface):
             self.rejections.add(FORCE, _NO_TISSUE)
             return ''
         if not fresh:
@@ -304,8 +343,8 @@ class ForcePath:
             reaction = reaction._replace(stiffness=pressing)
             self._s['stick']['stiffness'] = beside
         self._step, self._sample_revision = reaction.step, reaction.revision
-        self._sample_ns = sample_ns - _QUEUE_ALLOWANCE_NS
-        self._sample_state = reaction.state
+        self._s['sample_ns'] = sample_ns - _QUEUE_ALLOWANCE_NS
+        self._s['says_inside'] = reaction.state == INSIDE
         most = MAX_PULL_N if self.mode.is_grasper else self._max_resistance
         self._s['resistance'] = min(reaction.resistance, most)
         self._s['torque_resistance'] = min(
@@ -319,11 +358,15 @@ class ForcePath:
             self._s['held'] = min(self._s['held'], held + float(self.coupling.setup['slack'][0]))
         elif reaction.stiffness.any():
             reported = surface_stiffness(reaction.stiffness, self._stiffness)
-            self._plausibility.update_stiffness(self._state, now_ns, reported)
-        answered = self._began <= reaction.sequence <= self._sequence and self._contact == TOUCHING
+            since = None if self._stiffness_ns is None else now_ns - self._stiffness_ns
+            known = float(self._s['known'])
+            self._s['known'] = bounded_stiffness(known, since, reported, self._stiffness)
+            self._stiffness_ns = now_ns
+        began, last, left = (int(self._s[name]) for name in ('began', 'sequence', 'left'))
+        answered = began <= reaction.sequence <= last and self._contact == TOUCHING
         if reaction.state == INSIDE or answered:
             slot = reaction.sequence % _MAX_PENDING_CONTACTS
-            known = 0 <= self._sequence - reaction.sequence < _MAX_PENDING_CONTACTS
+            kept = 0 <= last - reaction.sequence < _MAX_PENDING_CONTACTS
             extrapolation.push(
                 self._history,
                 reaction.time,
@@ -334,10 +377,10 @@ class ForcePath:
                 topology=reaction.topology,
                 state=reaction.state,
                 torque=reaction.torque,
-                arms=self._past_arms[slot] if known else self._arms,
+                arms=self._past_arms[slot] if kept else self._arms,
                 immersed=reaction.immersed,
             )
-        elif reaction.sequence > self._left and not self._history['count'][0]:
+        elif reaction.sequence > left and not self._history['count'][0]:
             # The reported state is of a place that the tool approaches, or has touched since.
             if reaction.stiffness.any():
                 self._history['stiffness'] = reaction.stiffness
@@ -353,82 +396,21 @@ class ForcePath:
             entry = float(self.coupling.setup['entry_force'][0])
             self._s['borne'] = _BORNE_RATIO * max(entry, float(self._s['borne']))
 
-    def _accepts_inside(self, now_ns: int, surface: Surface | None) -> bool:
-        already = self._contact == INSIDE
-        return self._plausibility.accepts(now_ns, surface, self._blade, already=already)
-
-    def _begin(self, now_ns: int) -> None:
-        self._start_ns = now_ns
-        self._stale = False
-        self._s['energy'] = ENERGY_CREDIT_J
-        self._s['velocity'] = 0.0
-        self._leave_contact()
-
-    def _leave_contact(self) -> None:
-        self._proxy.reset()
-        self._contact = NONE
-        self._left = self._sequence
-        extrapolation.clear(self._history)
-
-    def _gain(self, now_ns: int, enabled: bool) -> float:
-        age = self.simulation_age(now_ns)
-        stale = enabled and age > self.haptics.stale_after
-        if stale and not self._stale:
-            self.stale_trips += self._sample_ns > 0
-        elif self._stale and not stale:
-            self._start_ns = now_ns
-        self._stale = stale
-        since = (now_ns - self._start_ns) * _SECOND
-        return safety.soft_start(since, self.haptics.soft_start) * safety.freshness(
-            age, self.haptics.stale_after, self.haptics.fade
+    def _is_plausible(self, now_ns: int, surface: Surface | None) -> bool:
+        """Return whether the blade can be in the tissue."""
+        return surface is not None and is_plausible_alone(
+            self.coupling.setup,
+            self._state,
+            surface.geometry,
+            surface.motion,
+            now_ns,
+            self._work,
         )
 
-    def _touch(self, now_ns: int, surface: Surface | None, enabled: bool) -> Any:
-        """Move the proxy; return its contact or nearest triangle, None while it is unused."""
-        self._sequence += 1
-        self._past_arms[self._sequence % _MAX_PENDING_CONTACTS] = self._arms
-        self._follow(now_ns, surface)
-        before = self._contact
-        inside = enabled and self._sample_state == INSIDE and self._accepts_inside(now_ns, surface)
-        if inside:
-            # The samples of the cut stay: the change of state has already voided the older ones.
-            if before != INSIDE:
-                self._s['stretch'] = 0.0
-                self._proxy.reset()
-                self._undented.release()
-                before_cut = self.force_norm / self.haptics.force_scale
-                self._s['held'] = before_cut + self.coupling.setup['slack'][0]
-            self._contact = INSIDE
-            assert surface is not None
-            edge = self._blade + self._s['stretch']
-            self._s['reach'] = self._plausibility.reach(surface, edge)
-            return None
-        if before == INSIDE or (before == TOUCHING and not enabled):
-            self._leave_contact()
-            self._start_ns = now_ns
-        if not enabled or surface is None:
-            return None
-        ground = self._undented.surface
-        assert ground is not None
-        touched = self._proxy.step(ground, self._undented.blend(now_ns), self._tip)
-        self._contact = TOUCHING if touched.touching else NONE
-        if self._contact != before:
-            extrapolation.clear(self._history)
-        if not touched.touching:
-            if before == TOUCHING:
-                self._left = self._sequence
-            return touched
-        self._undented.freeze()
-        self._plausibility.note_touch(now_ns)
-        if before != TOUCHING:
-            self._began = self._sequence
-            # Energy that the last contact dissipated is no credit; energy that it made is a debt.
-            self._s['energy'] = min(self._s['energy'], ENERGY_CREDIT_J)
-        return touched
-
-    def _follow(self, now_ns: int, surface: Surface | None) -> None:
-        if surface is None:
-            return
-        self._undented.follow(now_ns, surface)
-        if surface.revision >= self._sample_revision:
-            self._current_ns = now_ns
+    def _begin(self, now_ns: int) -> None:
+        self._s['start_ns'] = now_ns
+        self._s['stale'] = False
+        self._s['energy'] = ENERGY_CREDIT_J
+        self._s['velocity'] = 0.0
+        leave_contact_alone(self._state, self._history, self._proxy.touch.state)
+        self._contact = NONE

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge import contact_plausibility
-from cutting_trainer.haptic_bridge.force_kernels import TOUCHING
+from cutting_trainer.haptic_bridge.force_kernels import INSIDE, TOUCHING
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.haptic_bridge.scene_schema import (
@@ -41,12 +40,11 @@ def warm_up(
         tip = frame.to_device(place + np.array([0.0, 0.0, height * tool.radius]))
         stamp = (i + 1) * 1_000_000
         pose = StampedMessage(stamp, '', (*tip.tolist(), 0.0, 0.0, 0.0, 1.0))
-        values = (i, i, 0, i, 0, stamp, TOUCHING, *(1e-3,) * 18, 0, *(1e-3,) * 6)
+        # One says that the blade is in the tissue, which is to be checked.
+        said = INSIDE if i == 1 else TOUCHING
+        values = (i, i, 0, i, 0, stamp, said, *(1e-3,) * 18, 0, *(1e-3,) * 6)
         sample = StampedMessage(stamp, '', values)
         path.tick(stamp, state=state, pose=pose, sample=sample, surface=surface)
         surface = Surface(corners, triangle, revision=i + 1, topology=0, previous=surface)
         corners = corners + 1e-5
-    work = np.zeros(1, contact_plausibility.WORK)
-    contact_plausibility.is_near(surface.geometry, 1.0, corners[:2], tool.radius, work)
-    contact_plausibility.is_under(surface.geometry, 1.0, corners[:2], work)
     return path

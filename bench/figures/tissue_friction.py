@@ -5,7 +5,8 @@ import math
 import numpy as np
 
 from bench.figures.figure import Figure
-from cutting_trainer.haptic_bridge.proxy.friction import STICK, GrippingProxy, drag
+from cutting_trainer.haptic_bridge.proxy.friction import drag, make_stick
+from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.tissue_sim.contact.friction import Friction
 
@@ -37,8 +38,8 @@ def _loop(coefficient: float) -> float:
         [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0]]
     )
     ground = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), revision=1, topology=1)
-    stick = np.zeros(1, STICK)
-    proxy = GrippingProxy(_RADIUS, stick, Friction(coefficient))
+    stick = make_stick(Friction(coefficient))
+    proxy = Proxy(_RADIUS, stick)
     proxy.step(ground, 1.0, np.array([0.0, 0.0, 2 * _RADIUS]))
     way = _REACH * np.sin(np.linspace(0.0, 4 * math.pi, 2 * _TICKS + 1))
     pulls = np.zeros(len(way))

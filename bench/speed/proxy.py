@@ -12,11 +12,12 @@ import numpy as np
 
 from bench.common.clock import Figure, figure
 from cutting_trainer.haptic_bridge import extrapolation, force_kernels
-from cutting_trainer.haptic_bridge.contact_values import ContactReport
 from cutting_trainer.haptic_bridge.proxy.proxy import Proxy
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings, HapticsSettings, ToolSettings
+from cutting_trainer.node_common.kernels import kernel
 
+_command = kernel(force_kernels.command, nogil=True)
 POINTS = 101
 _TICKS_A_FRAME = 33
 
@@ -43,7 +44,6 @@ def measure(ticks: int, moving: bool) -> np.ndarray:
     stiffness, depth = np.diag([0.0, 0.0, 80.0]), np.array([0.0, 0.0, 4e-3])
     extrapolation.push(history, 1, where, force, stiffness, depth, topology=0, state=1)
     proxy, surface = Proxy(tool.radius), None
-    report, reach = ContactReport(tool.coupling_stiffness, tool.radius).record, np.zeros(3)
     spent = np.empty((ticks, 2))
     pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     for i in range(ticks):
@@ -57,20 +57,8 @@ def measure(ticks: int, moving: bool) -> np.ndarray:
         touch = proxy.step(surface, blend, pose[:3])
         middle = time.thread_time()
         force_kernels.to_tissue(setup, state, pose)
-        force_kernels.finish(
-            setup,
-            state,
-            history,
-            touch.state,
-            True,
-            report,
-            reach,
-            force_kernels.TOUCHING,
-            True,
-            i,
-            1.0,
-            1e-3,
-        )
+        state['proxy'], state['normal'] = touch.position, touch.normal
+        _command(setup, state, history, force_kernels.TOUCHING, True, i, 1.0, 1e-3)
         spent[i] = middle - start, time.thread_time() - middle
     return 1e6 * spent
 

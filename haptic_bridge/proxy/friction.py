@@ -11,11 +11,10 @@ The sphere rests over that point, not over the tip. Its depth there gives the no
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy.half_spaces import assign, norm
-from cutting_trainer.haptic_bridge.proxy.proxy import Proxy, Touch
+from cutting_trainer.haptic_bridge.proxy.half_spaces import norm
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
-from cutting_trainer.haptic_bridge.proxy.surface import Geometry, Surface
-from cutting_trainer.node_common.kernels import kernel
+from cutting_trainer.haptic_bridge.proxy.surface import Geometry
+from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.contact.friction import Friction
 
 STICK = record_type(
@@ -32,7 +31,7 @@ STICK = record_type(
 )
 
 
-@kernel(nogil=True)
+@inner
 def aim(stick: np.ndarray, tip: np.ndarray, normal: np.ndarray) -> None:
     """Compute the offset from the tip [m] to the anchor, square to a unit normal, shapes (3,)."""
     s = stick[0]
@@ -43,7 +42,7 @@ def aim(stick: np.ndarray, tip: np.ndarray, normal: np.ndarray) -> None:
         s.offset[i] = s.anchor[i] - tip[i] - along * normal[i]
 
 
-@kernel(nogil=True)
+@inner
 def follow(
     stick: np.ndarray, surface: Geometry, change: float, nodes: np.ndarray, weights: np.ndarray
 ) -> None:
@@ -90,11 +89,6 @@ def drag(
         s.force[i] = stiffness * s.offset[i]
 
 
-def make_proxy(radius: float, stick: np.ndarray, friction: Friction) -> Proxy:
-    """Return the proxy of a tool, with friction if there is any; arguments as `GrippingProxy`."""
-    return GrippingProxy(radius, stick, friction) if friction.sliding > 0.0 else Proxy(radius)
-
-
 def split_stiffness(stiffness: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the stiffness without its part along the surface, and that part [N/m].
 
@@ -106,60 +100,17 @@ def split_stiffness(stiffness: np.ndarray, normal: np.ndarray) -> tuple[np.ndarr
     return stiffness - along * (np.eye(3) - np.outer(normal, normal)), along
 
 
-class GrippingProxy(Proxy):
-    """A proxy with friction.
+def make_stick(friction: Friction) -> np.ndarray:
+    """Return the friction of a tool that touches nothing: record of STICK, shape (1,)."""
+    stick = np.zeros(1, STICK)
+    stick['sliding_friction'], stick['static_friction'] = friction.sliding, friction.static
+    return stick
 
-    Args:
-        radius: of the sphere [m].
-        stick: record of STICK, shape (1,); `drag` must follow each step that touches.
-        friction: of tool and tissue.
 
-    Raises:
-        ValueError: the radius is not a positive length.
-    """
-
-    def __init__(self, radius: float, stick: np.ndarray, friction: Friction) -> None:
-        super().__init__(radius)
-        self._stick = stick
-        self._over = np.zeros(3)
-        stick['sliding_friction'], stick['static_friction'] = friction.sliding, friction.static
-
-    @property
-    def place(self) -> np.ndarray:
-        """The centre of the sphere less its offset: from the tip, its depth leads there."""
-        place: np.ndarray = self.touch.position - self._stick['offset'][0]
-        return place
-
-    def reset(self) -> None:
-        """Detach from the surface; the next touch sticks where it happens."""
-        super().reset()
-        self._release()
-
-    def step(self, surface: Surface, blend: float, device: np.ndarray) -> Touch:
-        """Move the proxy: it stays over the anchor, and follows the tip along the normal."""
-        stick, known, before = self._stick[0], self._surface, self._blend
-        followed = surface is known or surface.continues(known)
-        if stick['placed'] and followed:
-            self._follow(surface, known, before, min(max(blend, 0.0), 1.0))
-            aim(self._stick, device, self.touch.normal)
-        np.add(device, stick['offset'], out=self._over)
-        touch = super().step(surface, blend, self._over)
-        if not touch.touching:
-            self._release()
-        elif not (stick['placed'] and followed) or stick['sliding']:
-            assign(stick['anchor'], touch.position)
-            stick['placed'] = True
-        return touch
-
-    def _follow(self, surface: Surface, known: Surface | None, before: float, blend: float) -> None:
-        nodes, weights = self.touch.nodes, self.touch.weights
-        if known is not None and surface is not known:
-            follow(self._stick, known.geometry, 1.0 - before, nodes, weights)
-            before = 0.0
-        if blend != before:
-            follow(self._stick, surface.geometry, blend - before, nodes, weights)
-
-    def _release(self) -> None:
-        self._stick['placed'] = self._stick['sliding'] = False
-        self._stick['offset'] = 0.0
-        self._stick['force'] = 0.0
+@inner
+def release(stick: np.ndarray) -> None:
+    """Let go: the next touch sticks where it happens. Record of STICK, shape (1,)."""
+    s = stick[0]
+    s.placed = s.sliding = False
+    s.offset[:] = 0.0
+    s.force[:] = 0.0

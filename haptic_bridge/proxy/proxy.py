@@ -11,8 +11,22 @@ import math
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy.kernels import STATE, carry, follow_device
-from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.haptic_bridge.proxy.friction import make_stick
+from cutting_trainer.haptic_bridge.proxy.kernels import (
+    ANOTHER,
+    NEXT,
+    SAME,
+    STATE,
+    detach_alone,
+    move_alone,
+)
+from cutting_trainer.haptic_bridge.proxy.surface import NO_GEOMETRY, Geometry, Surface
+from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION
+
+Way = tuple[Geometry, float, Geometry, float, int, float, float]
+"""Surface, known surface, their relation and the blends, as `kernels.move` takes them."""
+NO_WAY: Way = (NO_GEOMETRY, 0.0, NO_GEOMETRY, 0.0, ANOTHER, 0.0, 0.0)
+"""Where the proxy does not move."""
 
 
 class Touch:
@@ -67,6 +81,7 @@ class Proxy:
 
     Args:
         radius: of the sphere [m].
+        stick: its friction, record of `friction.STICK`, shape (1,); None: it has none.
 
     Attributes:
         touch: newest result.
@@ -75,11 +90,12 @@ class Proxy:
         ValueError: the radius is not a positive length.
     """
 
-    def __init__(self, radius: float) -> None:
+    def __init__(self, radius: float, stick: np.ndarray | None = None) -> None:
         if not (math.isfinite(radius) and radius > 0):
             raise ValueError(f'proxy: the radius is {radius} m, it must be positive')
         self.radius = radius
         self._state = np.zeros(1, STATE)
+        self._stick = make_stick(NO_FRICTION) if stick is None else stick
         self._device = np.zeros(3)
         self._surface: Surface | None = None
         self._blend = 0.0
@@ -87,18 +103,18 @@ class Proxy:
 
     @property
     def place(self) -> np.ndarray:
-        """The centre of the sphere that the depth leads to from the device [m], shape (3,)."""
-        return self.touch.position
+        """The centre of the sphere less its offset: from the tip, its depth leads there."""
+        place: np.ndarray = self.touch.position - self._stick['offset'][0]
+        return place
 
     def reset(self) -> None:
         """Detach from the surface, as during a cut: the next step starts at the device.
 
         If the device is inside the tissue then, the proxy comes out at the nearest point of the
-        surface, however deep: the caller must ramp the force.
+        surface, however deep: the caller must ramp the force. The next touch sticks where it
+        happens.
         """
-        self._surface = None
-        self._state['placed'] = False
-        self._state['touching'] = False
+        detach_alone(self._state, self._stick)
 
     def step(self, surface: Surface, blend: float, device: np.ndarray) -> Touch:
         """Move the proxy towards the device.
@@ -113,25 +129,33 @@ class Proxy:
         """
         self._device[:] = device
         self.touch.valid = all(map(math.isfinite, (blend, *self._device.tolist())))
-        if not self.touch.valid:
-            return self.touch
-        blend = min(max(float(blend), 0.0), 1.0)
-        known, start = self._surface, blend
-        followed = surface is known
-        if followed:
-            start = self._blend
-        elif known is not None and surface.continues(known):
-            self._carry(known, self._blend, 1.0)
-            followed, start = True, 0.0
-        if not followed:
-            self._state['nodes'] = -1
-            self._state['clearance'] = 0.0
-        if start != blend or not followed:
-            self._carry(surface, start, blend)
-        self._surface, self._blend = surface, blend
-        follow_device(surface.geometry, blend, self._device, self.radius, self._state)
+        if self.touch.valid:
+            way = self.way_to(surface, min(max(float(blend), 0.0), 1.0))
+            move_alone(*way, self._device, self.radius, self._state, self._stick)
         return self.touch
 
-    def _carry(self, surface: Surface, start: float, end: float) -> None:
-        motion = surface.motion * abs(end - start)
-        carry(surface.geometry, start, end, motion, self.radius, self._state)
+    def way_to(self, surface: Surface, blend: float) -> Way:
+        """Return how the surface comes from that of the last step, which it is from now on.
+
+        Args:
+            surface, blend: as of `step`.
+
+        Returns:
+            First arguments of `kernels.move`, which must follow.
+        """
+        known, before = self._surface, self._blend
+        self._surface, self._blend = surface, blend
+        if surface is known:
+            relation = SAME
+        else:
+            relation = NEXT if surface.continues(known) else ANOTHER
+            known = known or surface
+        return (
+            surface.geometry,
+            surface.motion,
+            known.geometry,
+            known.motion,
+            relation,
+            before,
+            blend,
+        )

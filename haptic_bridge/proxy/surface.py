@@ -34,6 +34,17 @@ class Geometry(NamedTuple):
     boxes: np.ndarray
 
 
+def _no_geometry() -> Geometry:
+    arrays = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 6)))
+    for array in arrays:
+        array.flags.writeable = False
+    return Geometry(*arrays)
+
+
+NO_GEOMETRY = _no_geometry()
+"""What kernels get where no surface is known yet."""
+
+
 class Surface:
     """A triangle surface between two revisions.
 
