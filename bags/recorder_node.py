@@ -45,7 +45,8 @@ from cutting_trainer.node_common.ros import (
 )
 from cutting_trainer.node_common.timing import request_preference
 
-_POLL_PERIOD_S = 0.004
+_POLL_PERIOD_S = 0.02
+"""[s] between two polls of all topics, whose queues hold a second of a 1 kHz stream."""
 _NICENESS = -5
 _DISCOVERY_PERIOD_S = 0.02
 _REVIEW_PERIOD_S = 1.0

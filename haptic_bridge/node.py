@@ -59,8 +59,6 @@ from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION, Friction
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
-MESH_POLL_PERIOD_S = 0.003
-"""[s] between two polls for a mesh of the simulation, while one is due."""
 STATE_POLL_PERIOD_S = 0.02
 """[s] between two polls of the operating state and for any mesh, while the bridge works."""
 GRAPH_CHECK_PERIOD_S = 0.25
@@ -204,7 +202,7 @@ class HapticBridge(ManagedNode):
                     self._watch_state()
                 except Exception as error:  # nothing else reports it, nor follows the mesh
                     self._machine.fault(f'the state watch failed: {type(error).__name__}: {error}')
-            time.sleep(MESH_POLL_PERIOD_S)
+            self._follower.wait(max(due - time.monotonic(), 0.0))
 
     def rest(self) -> None:
         """Set the force to zero; after the next activation force takes a command."""

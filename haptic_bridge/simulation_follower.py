@@ -1,5 +1,7 @@
 """Subscriptions of the bridge to the simulation: forces for the loop, meshes in a thread."""
 
+import threading
+import time
 from collections.abc import Callable
 
 from cutting_trainer_msgs.msg import ForceSample
@@ -12,6 +14,8 @@ from cutting_trainer.node_common.rejections import require_frame
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.tissue_sim.streaming.mesh_follower import MeshFollower
 
+_POLL_PERIOD_S = 0.003
+"""[s] between two polls for a mesh that is due."""
 _REVISION = ForceSampleCodec.fields['revision'].start
 
 
@@ -37,6 +41,8 @@ class SimulationFollower:
         self._watch = StreamMonitor(ros.FORCE, queues=True)
         self._late = 0
         self._revision = -1
+        self._awaits_frame = threading.Lock()  # released by a force of another revision
+        self._awaits_frame.acquire()
         self._force = ros.polled(node, ForceSample, ros.FORCE, qos.NEWEST_BEST_EFFORT)
 
     @property
@@ -62,6 +68,13 @@ class SimulationFollower:
         """
         return self.surface is None or self.surface.revision != self._revision
 
+    def wait(self, timeout: float) -> None:
+        """Wait until a mesh may have come, for a time at most [s]: each wake-up costs the loop."""
+        if self.mesh_is_due:
+            time.sleep(min(timeout, _POLL_PERIOD_S))
+        else:
+            self._awaits_frame.acquire(timeout=timeout)
+
     def cause(self, now_ns: int) -> str:
         """Return why the forces cannot be trusted at this time [ns]; '' if they can."""
         return self._watch.cause(now_ns)
@@ -77,7 +90,10 @@ class SimulationFollower:
             if taken is None:
                 return None, now_ns
             sample = self._codec.decode(taken[0])
-            self._revision = sample.values[_REVISION]
+            if sample.values[_REVISION] != self._revision:
+                self._revision = sample.values[_REVISION]
+                if self._awaits_frame.locked():
+                    self._awaits_frame.release()
             require_frame(ros.FORCE, sample.frame_id)
             problem = self._watch.see(taken[1], sample.stamp_ns, now_ns)
         except Exception as error:

@@ -386,7 +386,8 @@ def test_nothing_survives_a_killed_launcher_and_the_recorder_may_close_its_bag(
     launcher.wait(60)
     wait_for(lambda: not ledger.running())
     assert [name for name, _ in ledger.entries('end')] == ['recorder']
-    assert [name for name, _ in ledger.entries('SIGTERM')] == ['recorder']
+    # Once for each thread of the launcher that dies before the last one.
+    assert {name for name, _ in ledger.entries('SIGTERM')} == {'recorder'}
 
 
 # Nodes that are started again, and one that asks for it
