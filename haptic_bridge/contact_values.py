@@ -1,29 +1,23 @@
-"""Records of one tick of the force path: the commanded wrench and the reported contact."""
+"""Result of one tick of the force path: the commanded wrench and the reported contact.
+
+The kernel of a tick writes the bytes of the message `Contact`.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
-from cutting_trainer.haptic_bridge.proxy.surface import Surface
+from cutting_trainer.node_common.cdr_codec import ContactCodec
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.rejections import TISSUE_FRAME
+from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
-CONTACT = record_type(
-    [
-        ('nodes', 'i8', (9,)),
-        ('weights', 'f8', (9,)),
-        ('device', 'f8', (3,)),
-        ('proxy', 'f8', (3,)),
-        ('point', 'f8', (3,)),
-        ('normal', 'f8', (3,)),
-        ('external_force', 'f8', (3,)),
-        ('coupling_stiffness', 'f8'),
-        ('blade', 'f8', (2, 3)),
-        ('proxy_radius', 'f8'),
-        ('blade_facing', 'f8', (3,)),
-    ]
-)
-"""Fields of `Contact` from the nodes on; all of 8 bytes."""
+_CODEC = ContactCodec(TISSUE_FRAME)
+CONTACT = record_type(_CODEC.record_fields())
+"""The message `Contact`, by its fields."""
+_SECOND_NS = 1_000_000_000
+_OPEN, _CLOSED = ToolMode.OPEN_GRASPER.value, ToolMode.CLOSED_GRASPER.value
 
 
 class Tick(NamedTuple):
@@ -31,66 +25,66 @@ class Tick(NamedTuple):
 
     Attributes:
         wrench: force [N] and torque [N m] on the hand, as `WrenchStampedCodec` takes them.
-        contact: as `ContactCodec` takes it.
-        contact_stamp_ns: stamp of the device pose that the contact stems from.
+        message: `Contact` in CDR bytes.
+        contact_stamp_ns: its stamp, that of the device pose that the contact stems from.
         fault: reason to enter FAULT, which the caller must then do; '' when nothing is wrong.
     """
 
     wrench: tuple[float, ...]
-    contact: tuple[float, ...]
+    message: bytes
     contact_stamp_ns: int
     fault: str
 
+    @property
+    def contact(self) -> tuple[float, ...]:
+        """Return the values of the contact, as `ContactCodec` takes them."""
+        return _CODEC.decode(self.message).values
 
-class ContactReport:
-    """Packs the contact of a tick.
+
+def make_report(stiffness: float, radius: float, number: int = 0) -> np.ndarray:
+    """Return a contact without a touch: dtype CONTACT, shape (1,).
 
     Args:
         stiffness: of the coupling [N/m].
         radius: of the tool [m].
         number: of the tool, by its place in the list of the scene.
-
-    Attributes:
-        record: of `pack`, dtype CONTACT, shape (1,).
     """
-
-    def __init__(self, stiffness: float, radius: float, number: int = 0) -> None:
-        self._number = number
-        self.record = np.zeros(1, CONTACT)
-        self.record['coupling_stiffness'], self.record['proxy_radius'] = stiffness, radius
-        self._nodes = self.record['nodes'][0]
-        numbers = self.record.view(np.float64)[len(self._nodes) :]
-        self._numbers, self._facing = numbers[:-3], numbers[-3:]
-
-    def values(
-        self, sequence: int, state: int, surface: Surface | None, mode: int
-    ) -> tuple[float, ...]:
-        """Return the values of a contact, in the order of `ContactCodec`.
-
-        Args:
-            sequence: of the tick.
-            state: NONE, TOUCHING or INSIDE.
-            surface: the newest of the tissue.
-            mode: of the tool, one of `ToolMode`.
-        """
-        revision, topology = (surface.revision, surface.topology) if surface is not None else (0, 0)
-        return (
-            sequence,
-            state,
-            revision,
-            topology,
-            *self._nodes.tolist(),
-            *self._numbers.tolist(),
-            self._number,
-            mode,
-            *self._facing.tolist(),
-        )
+    empty = _CODEC.encode(0, (0,) * sum(count for _, _, count in _CODEC.layout))
+    # The numbers of a message are aligned from the end of its first four bytes on.
+    room = np.zeros(8 + len(empty), np.uint8)[4 : 4 + len(empty)]
+    room[:] = np.frombuffer(empty, np.uint8)
+    report = room.view(CONTACT)
+    report['coupling_stiffness'], report['proxy_radius'] = stiffness, radius
+    report['tool'] = number
+    return report
 
 
 @inner
-def pack(state: np.ndarray, proxy: np.ndarray, used: bool, contact: np.ndarray) -> None:
-    """Write tool and touch to a contact; of a proxy that is not used, all is zero."""
-    s, t, c = state[0], proxy[0], contact[0]
+def pack(
+    state: np.ndarray,
+    proxy: np.ndarray,
+    used: bool,
+    time: int,
+    revision: int,
+    topology: int,
+    enabled: bool,
+    report: np.ndarray,
+) -> None:
+    """Write tool and touch to a contact; of a proxy that is not used, all is zero.
+
+    Args:
+        state: dtype `force_kernels.STATE`, shape (1,).
+        proxy: dtype `proxy.kernels.STATE`, shape (1,).
+        used: whether there is a proxy in this tick.
+        time: stamp of the device pose [ns].
+        revision, topology: of the newest surface.
+        enabled: whether force is wanted; without it, jaws let go.
+        report: dtype CONTACT, shape (1,); written.
+    """
+    s, t, c = state[0], proxy[0], report[0]
+    c.seconds, c.nanoseconds = time // _SECOND_NS, time % _SECOND_NS
+    c.sequence, c.state, c.revision, c.topology = s.sequence, s.contact, revision, topology
+    c.mode = _OPEN if s.mode == _CLOSED and not enabled else s.mode
     for k in range(9):
         c.nodes[k] = max(t.nodes[k], 0) if used else 0
         c.weights[k] = t.weights[k] if used else 0.0
@@ -99,5 +93,5 @@ def pack(state: np.ndarray, proxy: np.ndarray, used: bool, contact: np.ndarray) 
         c.proxy[k] = s.tip[k] - s.external[k] / c.coupling_stiffness
         c.point[k] = c.proxy[k] + (t.contact[k] - t.position[k]) if used else 0.0
         c.normal[k] = t.normal[k] if used else 0.0
-        c.blade[0, k], c.blade[1, k] = s.blade[0, k], s.blade[1, k]
+        c.blade_root[k], c.blade_tip[k] = s.blade[0, k], s.blade[1, k]
         c.blade_facing[k] = s.facing[k]

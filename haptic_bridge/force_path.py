@@ -18,7 +18,7 @@ from cutting_trainer.haptic_bridge.contact_plausibility import (
     WORK,
     bounded_stiffness,
 )
-from cutting_trainer.haptic_bridge.contact_values import ContactReport, Tick
+from cutting_trainer.haptic_bridge.contact_values import Tick, make_report
 from cutting_trainer.haptic_bridge.devices.motion_gate import GATE
 from cutting_trainer.haptic_bridge.force_kernels import ENERGY_CREDIT_J, INSIDE, NONE, TOUCHING
 from cutting_trainer.haptic_bridge.force_tick import (
@@ -119,7 +119,7 @@ class ForcePath:
         self._stiffness = tool.coupling_stiffness
         self._stiffness_ns: int | None = None
         self._number = number
-        self._report = ContactReport(tool.coupling_stiffness, tool.radius, number)
+        self._report = make_report(tool.coupling_stiffness, tool.radius, number)
         self._pose = np.zeros(7)
         self._gate = np.zeros(1, GATE)
         self._pose_stamp = self._pose_ns = 0
@@ -244,12 +244,8 @@ class ForcePath:
         zero = bool(fault) or state is CrtkState.FAULT
         if not self._compute(now_ns, surface, enabled, zero):
             fault = fault or 'the commanded force was not finite'
-        mode = self.mode
-        if mode is ToolMode.CLOSED_GRASPER and not enabled:
-            mode = ToolMode.OPEN_GRASPER  # without force, the jaws let go
-        sequence = int(self._s['sequence'])
-        contact = self._report.values(sequence, self._contact, surface, mode)
-        return Tick(tuple(self._wrench.tolist()), contact, self._pose_stamp, fault)
+        wrench, message = tuple(self._wrench.tolist()), self._report.tobytes()
+        return Tick(wrench, message, self._pose_stamp, fault)
 
     def _compute(self, now_ns: int, surface: Surface | None, enabled: bool, zero: bool) -> bool:
         """Compute contact, command and report; return False where they are not finite.
@@ -262,7 +258,9 @@ class ForcePath:
         """
         undented = self._undented
         newest, motion, way = NO_GEOMETRY, 0.0, NO_WAY
+        revision, topology = -1, 0
         if surface is not None:
+            revision, topology = surface.revision, surface.topology
             undented.follow(now_ns, surface)
             newest, motion = surface.geometry, surface.motion
             if enabled:
@@ -274,7 +272,7 @@ class ForcePath:
             self._history,
             self._depths,
             self._past_arms,
-            self._report.record,
+            self._report,
             self._proxy.touch.state,
             self._work,
             newest,
@@ -284,8 +282,9 @@ class ForcePath:
             self._pose_stamp,
             enabled,
             zero,
-            surface is not None,
-            surface is not None and surface.revision >= self._sample_revision,
+            revision,
+            topology,
+            surface is not None and revision >= self._sample_revision,
         )
         if self._contact == TOUCHING:
             undented.freeze()

@@ -47,7 +47,8 @@ def tick(
     time: int,
     enabled: bool,
     faulty: bool,
-    seen: bool,
+    revision: int,
+    topology: int,
     current: bool,
 ) -> tuple[int, bool]:
     """Compute contact, command and report of a tick: one call from Python.
@@ -66,7 +67,7 @@ def tick(
         time: stamp of the device pose [ns].
         enabled: whether force is wanted.
         faulty: whether the force goes to zero at once.
-        seen: whether there is a surface.
+        revision, topology: of the newest surface; revision -1 where there is none.
         current: whether it is as new as the newest sample.
 
     Returns:
@@ -83,7 +84,7 @@ def tick(
             arms[slot, end, k] = s.arms[end, k]
     if current:
         s.current_ns = now
-    used = False
+    seen, used = revision >= 0, False
     if not _stay_inside(setup, state, proxy, work, newest, newest_motion, now, enabled and seen):
         used = enabled and seen
         _leave(state, history, proxy, now, enabled)
@@ -120,7 +121,7 @@ def tick(
     if s.contact != NONE:
         s.contact_time += elapsed
     s.max_norm = max(s.max_norm, safety.norm(s.force))
-    pack(state, proxy, used, report)
+    pack(state, proxy, used, time, max(revision, 0), topology, enabled, report)
     return s.contact, finite
 
 

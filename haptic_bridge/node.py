@@ -28,7 +28,6 @@ from cutting_trainer.haptic_bridge.simulation_follower import SimulationFollower
 from cutting_trainer.haptic_bridge.warm_up import warm_up
 from cutting_trainer.node_common import qos, ros
 from cutting_trainer.node_common.cdr_codec import (
-    ContactCodec,
     PoseStampedCodec,
     StampedMessage,
     WireError,
@@ -139,7 +138,6 @@ class HapticBridge(ManagedNode):
         self._faults, self._last_fault, self._was_faulty = 0, '', False
         self._pose_codec = PoseStampedCodec()
         self._wrench_codec = WrenchStampedCodec(f'{ros.ARM}_base')
-        self._contact_codec = ContactCodec(ros.FRAME)
         self._pose = ros.polled(self, PoseStamped, f'{ros.ARM}/measured_cp', qos.NEWEST_BEST_EFFORT)
         self._wrench = self.create_publisher(
             WrenchStamped, f'{ros.ARM}/{device.force_topic}', qos.STREAM
@@ -282,8 +280,7 @@ class HapticBridge(ManagedNode):
                 self._latency.add(time.time_ns() - pose.stamp_ns)
             if tick.fault:
                 self._machine.fault(tick.fault)
-            contact = self._contact_codec.encode(tick.contact_stamp_ns, tick.contact)
-            ros.publish_raw(self._contact, contact)
+            ros.publish_raw(self._contact, tick.message)
         except Exception as error:
             self._machine.fault(f'the force loop failed: {type(error).__name__}: {error}')
             self._send((0.0,) * 6, now)

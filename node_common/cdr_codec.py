@@ -20,6 +20,7 @@ _HEADER = struct.Struct('<4siII')
 _FRAME = 4
 """Place of the frame_id among the unpacked values of a message; its numbers follow."""
 _SIZES = {'B': 1, 'i': 4, 'I': 4, 'Q': 8, 'd': 8}
+_KINDS = {'B': 'u1', 'i': '<i4', 'I': '<u4', 'Q': '<u8', 'd': '<f8'}
 _NANOSECONDS = 1_000_000_000
 _MAX_TRAILING_PADDING = 3
 MAX_FRAME_ID_LENGTH = 255
@@ -109,6 +110,19 @@ class StampedCodec:
                 'values that do not fit',
                 f'{self.name} takes {list(self.fields)} as flat numbers, got {values}: {error}',
             ) from None
+
+    def record_fields(self) -> dict[str, Any]:
+        """Return a message of this frame as `np.dtype` takes it: the layout and its stamp."""
+        offset = _HEADER.size + len(self._frame) - len(_ENCAPSULATION)
+        fields: list[tuple[str, Any, int]] = [('seconds', '<i4', 4), ('nanoseconds', '<u4', 8)]
+        for name, code, count in self.layout:
+            offset += -offset % _SIZES[code]
+            kind = _KINDS[code]
+            fields.append((name, kind if count == 1 else (kind, (count,)), offset + 4))
+            offset += _SIZES[code] * count
+        names, formats, offsets = (list(column) for column in zip(*fields, strict=True))
+        size = self._packer.size
+        return {'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': size}
 
     def decode(self, data: bytes) -> StampedMessage:
         """Return stamp, frame and numbers of a message in CDR bytes."""

@@ -68,6 +68,19 @@ def test_rclpy_reads_what_is_written_and_the_other_way_round(codec, data):
 
 
 @pytest.mark.parametrize('codec', CODECS, ids=lambda c: c.__name__)
+@given(st.data())
+def test_a_record_that_a_kernel_fills_has_the_bytes_of_the_message(codec, data):
+    stamp, frame, values = data.draw(STAMPS), data.draw(FRAMES), data.draw(values_of(codec))
+    ours = codec(frame)
+    bytes_of = bytearray(ours.encode(0, [0] * len(values)))
+    record = np.frombuffer(bytes_of, np.dtype(ours.record_fields()))
+    record['seconds'], record['nanoseconds'] = divmod(stamp, 10**9)
+    for name, where in codec.fields.items():
+        record[name] = values[where][0] if len(values[where]) == 1 else values[where]
+    assert bytes(bytes_of) == ours.encode(stamp, values)
+
+
+@pytest.mark.parametrize('codec', CODECS, ids=lambda c: c.__name__)
 @pytest.mark.parametrize('length', range(41))
 def test_bytes_are_those_of_rclpy_for_every_length_of_the_frame_id(codec, length):
     """All but the padding, which rclpy leaves as it finds it: where no byte of ours can matter."""

@@ -17,10 +17,10 @@ class _Fields(np.record):  # type: ignore[misc]  # final in its stubs only
         self[name] = value
 
 
-def record_type(fields: list[Any]) -> np.dtype[Any]:
+def record_type(fields: Any) -> np.dtype[Any]:
     """Return the type of a record, also for kernels that run in Python (NUMBA_DISABLE_JIT=1).
 
     Args:
-        fields: name, kind and shape of each, as `np.dtype` takes them.
+        fields: name, kind and shape of each, or the layout of all, as `np.dtype` takes them.
     """
     return np.dtype((_Fields, fields)) if config.DISABLE_JIT else np.dtype(fields)
