@@ -49,7 +49,7 @@ from cutting_trainer.node_common.parameters import (
     tool_parameter,
 )
 from cutting_trainer.node_common.publishers import PublisherMonitor
-from cutting_trainer.node_common.realtime import Receivers, prepare, run_real_time
+from cutting_trainer.node_common.realtime import prepare, run_real_time
 from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
@@ -179,7 +179,6 @@ class HapticBridge(ManagedNode):
         announce_ready(self)
         self._real_time = prepare()
         self.get_logger().info(self._real_time)
-        self._receivers = Receivers()
         run_real_time(self._loop, self._tick, stop)
         beside.join(1.0)
 
@@ -265,7 +264,6 @@ class HapticBridge(ManagedNode):
             assert self._e_stop is not None
             self._e_stop.poll(self._epoch + now)
             pose = self._take_pose(now)
-            self._receivers.note(arrived=pose is not None)
             sample, sample_ns = self._follower.take_force(now)
             tick = self._path.tick(
                 now,

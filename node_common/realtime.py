@@ -11,21 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cutting_trainer.node_common.lifecycle import Stop
-from cutting_trainer.node_common.timing import (
-    RECEIVES,
-    PeriodicLoop,
-    request_preference,
-    request_real_time,
-)
+from cutting_trainer.node_common.timing import PeriodicLoop, request_preference, request_real_time
 
 PRIORITY = 40
-HELPER_PRIORITY = 20
-URGENT_PRIORITY = 41
-"""Of the threads that receive, while a loop waits for messages in vain."""
-MAX_VAIN_TICKS = 5
-"""Ticks in a row without a message after which it does."""
-URGENT_TICKS = 1000
-"""Ticks for which these threads keep that priority after the last one in vain."""
+HELPER_PRIORITY = 39
+"""Of all other threads of the process, those that receive messages among them: below that of the
+loop, and above that of other programs, behind which poses came 50 ms late."""
 NICENESS = -15
 """Of all threads where no real-time priority is allowed, before that of the simulation."""
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
@@ -52,43 +43,6 @@ def run_real_time(loop: PeriodicLoop, tick: Callable[[int], None], stop: Stop) -
     loop.start()
     while not stop.is_set():
         tick(loop.wait())
-
-
-class Receivers:
-    """Threads of this process in which DDS receives the messages of a loop.
-
-    Their priority is below that of the loop. Where other work of real-time priority, or the host of
-    a virtual machine, takes most of what loops leave of a processor, messages wait for these
-    threads: poses came 50 ms late to a loop in time. While a loop waits in vain, they go before it.
-    Always, that would cost some of its ticks.
-
-    Create it in the loop's thread after `prepare`.
-    """
-
-    def __init__(self) -> None:
-        self._threads = [
-            int(thread.name)
-            for thread in Path('/proc/self/task').iterdir()
-            if (thread / 'comm').read_text().startswith(RECEIVES)
-        ]
-        self._vain = self._urgent = 0
-
-    def note(self, *, arrived: bool) -> None:
-        """Record in every tick whether a message has arrived."""
-        self._vain = 0 if arrived else self._vain + 1
-        if self._vain >= MAX_VAIN_TICKS:
-            if not self._urgent:
-                self._give(URGENT_PRIORITY)
-            self._urgent = URGENT_TICKS
-        elif self._urgent:
-            self._urgent -= 1
-            if not self._urgent:
-                self._give(HELPER_PRIORITY)
-
-    def _give(self, priority: int) -> None:
-        for thread in self._threads:
-            with contextlib.suppress(OSError):  # it has ended, or it is not allowed
-                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def prepare() -> str:
