@@ -18,7 +18,7 @@ Work = Literal['force loop', 'messages', 'frames', 'other']
 may run anywhere."""
 LOOPS_PER_PROCESSOR = 2
 """Force loops that share a processor: those of an arm and its bridge."""
-_RECEIVES = 'dds.'
+_RECEIVES = 'dds.udp'
 """How the names of the threads begin in which DDS receives."""
 _ADDRESS = '\0cutting_trainer.processors'
 
@@ -45,8 +45,8 @@ def place(pid: int, processors: set[int]) -> None:
 
 def place_receivers(pid: int, processors: set[int]) -> None:
     """Put those threads of a process on some processors in which DDS receives."""
-    with suppress(OSError):  # the process or a thread has just ended
-        for thread in Path(f'/proc/{pid}/task').iterdir():
+    for thread in Path(f'/proc/{pid}/task').glob('*'):
+        with suppress(OSError):  # it has just ended
             if (thread / 'comm').read_text().startswith(_RECEIVES):
                 os.sched_setaffinity(int(thread.name), processors)
 
