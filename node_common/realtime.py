@@ -11,12 +11,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cutting_trainer.node_common.lifecycle import Stop
-from cutting_trainer.node_common.timing import PeriodicLoop, request_preference, request_real_time
+from cutting_trainer.node_common.timing import (
+    RECEIVES,
+    PeriodicLoop,
+    request_preference,
+    request_real_time,
+)
 
 PRIORITY = 40
-HELPER_PRIORITY = 39
-"""Of all other threads of the process, those that receive messages among them: below that of the
-loop, and above that of other programs, behind which poses came 50 ms late."""
+RECEIVER_PRIORITY = 39
+"""Of the threads that receive messages: below that of the loop, and above that of other programs,
+behind which poses came 50 ms late."""
+HELPER_PRIORITY = 20
+"""Of all other threads of the process. One may compute for milliseconds, at the arrival of a mesh:
+a driver of real-time priority goes before it."""
 NICENESS = -15
 """Of all threads where no real-time priority is allowed, before that of the simulation."""
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
@@ -65,8 +73,9 @@ def prepare() -> str:
         for thread in Path('/proc/self/task').iterdir():
             if int(thread.name) != own:
                 with contextlib.suppress(OSError):  # it has just ended
-                    helper = os.sched_param(HELPER_PRIORITY)
-                    os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, helper)
+                    receives = (thread / 'comm').read_text().startswith(RECEIVES)
+                    priority = os.sched_param(RECEIVER_PRIORITY if receives else HELPER_PRIORITY)
+                    os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, priority)
     else:
         granted = f'{granted}; {request_preference(NICENESS)}'
     return f'{granted}; {lock_memory()}'

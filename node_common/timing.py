@@ -15,6 +15,8 @@ MAX_TIMELY_LATENESS_S = 0.0005
 """Latest wake-up after the deadline that still counts as timely."""
 FRAME_NICENESS = -10
 """Niceness of the processes on the critical path of a tissue frame."""
+RECEIVES = 'dds.udp'
+"""How the names of the threads begin in which DDS receives."""
 _GROUP = Path('/proc/self/autogroup')
 
 

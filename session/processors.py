@@ -13,13 +13,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
+from cutting_trainer.node_common.timing import RECEIVES
+
 Work = Literal['force loop', 'messages', 'frames', 'other']
 """Work of a node: a loop of 1 kHz, the messages of such loops, the frames of the tissue, or what
 may run anywhere."""
 LOOPS_PER_PROCESSOR = 2
 """Force loops that share a processor: those of an arm and its bridge."""
-_RECEIVES = 'dds.udp'
-"""How the names of the threads begin in which DDS receives."""
 _ADDRESS = '\0cutting_trainer.processors'
 
 
@@ -47,7 +47,7 @@ def place_receivers(pid: int, processors: set[int]) -> None:
     """Put those threads of a process on some processors in which DDS receives."""
     for thread in Path(f'/proc/{pid}/task').glob('*'):
         with suppress(OSError):  # it has just ended
-            if (thread / 'comm').read_text().startswith(_RECEIVES):
+            if (thread / 'comm').read_text().startswith(RECEIVES):
                 os.sched_setaffinity(int(thread.name), processors)
 
 
