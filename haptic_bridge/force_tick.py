@@ -15,7 +15,7 @@ from cutting_trainer.haptic_bridge.force_kernels import (
     TOUCHING,
     command,
 )
-from cutting_trainer.haptic_bridge.proxy import kernels as proxy_kernels
+from cutting_trainer.haptic_bridge.proxy import step
 from cutting_trainer.haptic_bridge.proxy.surface import Geometry
 from cutting_trainer.node_common.kernels import inner, kernel
 
@@ -62,7 +62,7 @@ def tick(
         work: dtype `contact_plausibility.WORK`, shape (1,).
         newest, newest_motion: surface of the tissue, and its largest motion [m].
         ground, ground_motion, known, known_motion, relation, before, blend: of the surface on which
-            the proxy moves, as the first arguments of `proxy.kernels.move`.
+            the proxy moves, as the first arguments of `proxy.step.move`.
         now: monotonic clock [ns].
         time: stamp of the device pose [ns].
         enabled: whether force is wanted.
@@ -89,7 +89,7 @@ def tick(
         used = enabled and seen
         _leave(state, history, proxy, now, enabled)
         if used:
-            proxy_kernels.move(
+            step.move(
                 ground,
                 ground_motion,
                 known,
@@ -163,7 +163,7 @@ def _stay_inside(
     if s.contact != INSIDE:
         # The samples of the cut stay: the change of state has already voided the older ones.
         s.stretch[:] = 0.0
-        proxy_kernels.detach(proxy, s.stick)
+        step.detach(proxy, s.stick)
         s.held = safety.norm(s.force) / c.force_scale + c.slack
         s.contact = INSIDE
     edge = work[0].edge
@@ -209,7 +209,7 @@ def _leave(
 def leave_contact(state: np.ndarray, history: np.ndarray, proxy: np.ndarray) -> None:
     """End the contact; arguments as of `tick`."""
     s = state[0]
-    proxy_kernels.detach(proxy, s.stick)
+    step.detach(proxy, s.stick)
     s.contact, s.left = NONE, s.sequence
     history[0].count = 0
 

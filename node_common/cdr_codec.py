@@ -113,13 +113,11 @@ class StampedCodec:
 
     def record_fields(self) -> dict[str, Any]:
         """Return a message of this frame as `np.dtype` takes it: the layout and its stamp."""
-        offset = _HEADER.size + len(self._frame) - len(_ENCAPSULATION)
         fields: list[tuple[str, Any, int]] = [('seconds', '<i4', 4), ('nanoseconds', '<u4', 8)]
-        for name, code, count in self.layout:
-            offset += -offset % _SIZES[code]
+        places = _places(self.layout, len(self._frame))
+        for (name, code, count), place in zip(self.layout, places, strict=True):
             kind = _KINDS[code]
-            fields.append((name, kind if count == 1 else (kind, (count,)), offset + 4))
-            offset += _SIZES[code] * count
+            fields.append((name, kind if count == 1 else (kind, (count,)), place))
         names, formats, offsets = (list(column) for column in zip(*fields, strict=True))
         size = self._packer.size
         return {'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': size}
@@ -219,16 +217,24 @@ class StampedCodec:
             raise WireError('frame_id that is no text', text) from None
 
 
+def _places(layout: tuple[tuple[str, str, int], ...], frame_length: int) -> list[int]:
+    """Return where the fields of a message begin. CDR aligns from the end of the encapsulation."""
+    places, end = [], _HEADER.size + frame_length
+    for _, code, count in layout:
+        place = end + -(end - len(_ENCAPSULATION)) % _SIZES[code]
+        places.append(place)
+        end = place + _SIZES[code] * count
+    return places
+
+
 @lru_cache(maxsize=256)
 def _message(layout: tuple[tuple[str, str, int], ...], frame_length: int) -> struct.Struct:
-    """Return the struct of a message. CDR aligns from the end of the encapsulation."""
+    """Return the struct of a message."""
     codes = [f'{_HEADER.format}{frame_length}s']
-    offset = _HEADER.size - len(_ENCAPSULATION) + frame_length
-    for _, code, count in layout:
-        size = _SIZES[code]
-        padding = -offset % size
-        codes.append(f'{padding}x{count}{code}')
-        offset += padding + size * count
+    end = _HEADER.size + frame_length
+    for (_, code, count), place in zip(layout, _places(layout, frame_length), strict=True):
+        codes.append(f'{place - end}x{count}{code}')
+        end = place + _SIZES[code] * count
     return struct.Struct(''.join(codes))
 
 

@@ -1,8 +1,8 @@
-"""Compiled steps of the proxy; `proxy.py` describes the method."""
+"""Compiled search of the proxy's place and contact; `proxy.py` describes the method."""
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy import friction, half_spaces
+from cutting_trainer.haptic_bridge.proxy import half_spaces
 from cutting_trainer.haptic_bridge.proxy.half_spaces import SPACES
 from cutting_trainer.haptic_bridge.proxy.inside_test import MAX_FAN, TIE_TOLERANCE_M, is_inside
 from cutting_trainer.haptic_bridge.proxy.neighbourhood import (
@@ -15,7 +15,7 @@ from cutting_trainer.haptic_bridge.proxy.neighbourhood import (
 )
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.haptic_bridge.proxy.surface import Geometry
-from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.kernels import inner
 
 PATCHES = 3
 """Triangles that a contact reports."""
@@ -43,9 +43,6 @@ STATE = record_type(
         ('spaces', SPACES, (1,)),
     ]
 )
-ANOTHER, SAME, NEXT = range(3)
-"""A surface in relation to that of the last step: one that has nothing to do with it, the same one,
-or the one that begins where it ends."""
 ARRIVED, MOVING, AT_RIM = range(3)
 _TOLERANCE_M = 3e-10
 """[m] Penetration below which nothing is corrected."""
@@ -53,11 +50,10 @@ _COVER_TOLERANCE_M = 1e-10
 """[m] by which a triangle may stick out of a half-space that covers it."""
 _MIN_STEP_M = 1e-7
 """[m] Step that ends the search: a hundredth of an encoder step."""
-_GATHER_MARGIN = 0.1
+GATHER_MARGIN = 0.1
 """Shortest path, in radii, for which one set of gathered triangles suffices."""
 _MAX_GATHERS = 12
 _MAX_STEPS = 16
-_MAX_SUBSTEPS = 8
 _EXIT_HEIGHT = 0.01
 """Height in radii over the surface from which a proxy that was inside is pushed out."""
 _CONTACT_GAP = 0.01
@@ -70,130 +66,13 @@ _MAX_SWEEPS = 30
 
 
 @inner
-def move(
-    surface: Geometry,
-    motion: float,
-    known: Geometry,
-    known_motion: float,
-    relation: int,
-    before: float,
-    blend: float,
-    device: np.ndarray,
-    radius: float,
-    state: np.ndarray,
-    stick: np.ndarray,
-) -> None:
-    """Move the proxy with the surface, then towards the device, and write its contact.
-
-    With friction it stays over its anchor, and follows the device along the normal.
-
-    Args:
-        surface: of the tissue.
-        motion: largest displacement of its nodes from start to end [m].
-        known, known_motion: the same of the last step.
-        relation: SAME, NEXT, or ANOTHER where there is no last step.
-        before: blend of the last step.
-        blend: 0 at the surface's start, 1 at its end.
-        device: tip [m], shape (3,).
-        radius: of the proxy [m].
-        state: record of STATE, shape (1,), written.
-        stick: record of `friction.STICK`, shape (1,), written; `friction.drag` must follow each
-            step that touches.
-    """
-    s, grip = state[0], stick[0]
-    if not s.placed:
-        relation = ANOTHER
-    rubs = grip.sliding_friction > 0.0
-    stays = rubs and grip.placed and relation != ANOTHER
-    start = before
-    if relation == NEXT:
-        if stays:
-            friction.follow(stick, known, 1.0 - before, s.nodes, s.weights)
-        _carry(known, before, 1.0, known_motion, radius, state)
-        start = 0.0
-    elif relation == ANOTHER:
-        start = blend
-        s.nodes[:] = -1
-        s.clearance = 0.0
-    if stays:
-        friction.follow(stick, surface, blend - start, s.nodes, s.weights)
-        friction.aim(stick, device, s.normal)
-    for k in range(3):
-        s.over[k] = device[k] + grip.offset[k]
-    if start != blend or relation == ANOTHER:
-        _carry(surface, start, blend, motion, radius, state)
-    _follow_device(surface, blend, s.over, radius, state)
-    if not rubs:
-        return
-    if not s.touching:
-        friction.release(stick)
-    elif not stays or grip.sliding:
-        half_spaces.assign(grip.anchor, s.position)
-        grip.placed = True
-
-
-move_alone = kernel(move, nogil=True)
-"""The same for Python."""
-
-
-@inner
-def detach(state: np.ndarray, stick: np.ndarray) -> None:
-    """Let the next step start at the device; arguments as of `move`."""
-    state[0].placed = state[0].touching = False
-    friction.release(stick)
-
-
-detach_alone = kernel(detach)
-"""The same for Python."""
-
-
-@inner
-def _follow_device(
-    surface: Geometry, blend: float, device: np.ndarray, radius: float, state: np.ndarray
-) -> None:
-    """Move the proxy towards the device [m], shape (3,), and write its contact."""
-    s = state[0]
-    if not s.placed:
-        half_spaces.assign(s.position, device)
-        half_spaces.assign(s.device, device)
-        s.nodes[:] = -1
-        s.placed = True
-        _leave_tissue(surface, blend, radius, state)
-    stride = 2.0 * _distance(device, s.device)
-    half_spaces.assign(s.device, device)
-    half_spaces.assign(s.goal, device)
-    _seek(surface, blend, min(stride, 2.0 * radius), _GATHER_MARGIN * radius, radius, state)
-    s.depth = _distance(device, s.position)
-    _report(surface, blend, radius, state)
-
-
-@inner
-def _carry(
-    surface: Geometry, start: float, end: float, motion: float, radius: float, state: np.ndarray
-) -> None:
-    """Move the proxy with the surface between two blends, in steps that cannot skip it."""
-    s = state[0]
-    if not s.placed:
-        return
-    motion *= abs(end - start)
-    wanted = np.ceil(motion / max(0.5 * s.clearance, 1e-9))
-    steps = int(min(max(wanted, 1.0), _MAX_SUBSTEPS))
-    for i in range(1, steps + 1):
-        blend = start + (end - start) * i / steps
-        if motion / steps >= s.clearance and _leave_tissue(surface, blend, radius, state):
-            continue
-        if i < steps or wanted > 1:
-            half_spaces.assign(s.goal, s.position)
-            _seek(surface, blend, 0.0, _GATHER_MARGIN * radius, radius, state)
-
-
-@inner
-def _distance(a: np.ndarray, b: np.ndarray) -> float:
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the distance of two points [m], shape (3,)."""
     return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
 @inner
-def _seek(
+def seek(
     surface: Geometry, blend: float, stride: float, margin: float, radius: float, state: np.ndarray
 ) -> None:
     """Move the position as close to the goal as the surface allows, in bounded time.
@@ -207,7 +86,7 @@ def _seek(
     steps = 0
     s.clearance = radius
     for _ in range(_MAX_GATHERS):
-        ahead = _distance(s.goal, s.position)
+        ahead = distance(s.goal, s.position)
         reach = radius + max(margin, min(ahead, stride))
         gather(surface, blend, s.position, reach, np.int64(CAPACITY), s.near)
         if near.count == 0:
@@ -329,7 +208,7 @@ def _linearise(radius: float, state: np.ndarray) -> None:
 
 
 @inner
-def _leave_tissue(surface: Geometry, blend: float, radius: float, state: np.ndarray) -> bool:
+def leave_tissue(surface: Geometry, blend: float, radius: float, state: np.ndarray) -> bool:
     """Move a proxy inside the tissue to the nearest point outside; True if it was inside."""
     s = state[0]
     near = s.near[0]
@@ -340,12 +219,12 @@ def _leave_tissue(surface: Geometry, blend: float, radius: float, state: np.ndar
     for axis in range(3):
         s.position[axis] = near.closest[axis, nearest] + _EXIT_HEIGHT * radius * s.step[axis]
     half_spaces.assign(s.goal, s.position)
-    _seek(surface, blend, 0.0, radius, radius, state)
+    seek(surface, blend, 0.0, radius, radius, state)
     return True
 
 
 @inner
-def _report(surface: Geometry, blend: float, radius: float, state: np.ndarray) -> None:
+def report(surface: Geometry, blend: float, radius: float, state: np.ndarray) -> None:
     """Distribute the force among the triangles under the sphere, as a frictionless contact does.
 
     In an indentation or a crease the sphere rests on several triangles. Their pushes are not

@@ -12,19 +12,13 @@ import math
 import numpy as np
 
 from cutting_trainer.haptic_bridge.proxy.friction import make_stick
-from cutting_trainer.haptic_bridge.proxy.kernels import (
-    ANOTHER,
-    NEXT,
-    SAME,
-    STATE,
-    detach_alone,
-    move_alone,
-)
+from cutting_trainer.haptic_bridge.proxy.kernels import STATE
+from cutting_trainer.haptic_bridge.proxy.step import ANOTHER, NEXT, SAME, detach_alone, move_alone
 from cutting_trainer.haptic_bridge.proxy.surface import NO_GEOMETRY, Geometry, Surface
 from cutting_trainer.tissue_sim.contact.friction import NO_FRICTION
 
 Way = tuple[Geometry, float, Geometry, float, int, float, float]
-"""Surface, known surface, their relation and the blends, as `kernels.move` takes them."""
+"""Surface, known surface, their relation and the blends, as `step.move` takes them."""
 NO_WAY: Way = (NO_GEOMETRY, 0.0, NO_GEOMETRY, 0.0, ANOTHER, 0.0, 0.0)
 """Where the proxy does not move."""
 
@@ -141,7 +135,7 @@ class Proxy:
             surface, blend: as of `step`.
 
         Returns:
-            First arguments of `kernels.move`, which must follow.
+            First arguments of `step.move`, which must follow.
         """
         known, before = self._surface, self._blend
         self._surface, self._blend = surface, blend
