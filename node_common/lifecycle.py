@@ -32,6 +32,9 @@ YIELD_S = 0.0005
 """Pause between two callbacks: a flood of messages must leave the interpreter to the loops."""
 DEACTIVATE_TIMEOUT_S = 5.0
 """Time for a deactivated node to leave its work."""
+_DESTROY_TIMEOUT_S = 3
+"""Time for the middleware to leave the graph, once the node's work is done. Fast DDS may deadlock
+there (its issue 6502), and no other thread of Python runs meanwhile: SIGALRM ends the process."""
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 _OWNED = ('publishers', 'subscriptions', 'clients', 'services', 'timers')
 
@@ -297,8 +300,12 @@ def run(make_node: Callable[[], ManagedNode]) -> Any:
         try:
             node.end()
         finally:
+            output.close()
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.alarm(_DESTROY_TIMEOUT_S)
             node.destroy_node()
             rclpy.shutdown()
+            signal.alarm(0)
     return node
 
 

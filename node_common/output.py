@@ -255,7 +255,7 @@ def install() -> None:
         raw = _Unblocked(number, _redirected[number].outlet)
         text = io.TextIOWrapper(raw, 'utf-8', 'backslashreplace', line_buffering=True)  # type: ignore[type-var]
         setattr(sys, name, text)
-    atexit.register(_close)
+    atexit.register(close)
 
 
 def announce(line: str) -> None:
@@ -277,7 +277,8 @@ def dropped() -> int:
     return sum(way.outlet.dropped for way in set(_redirected.values()))
 
 
-def _close() -> None:
+def close() -> None:
+    """Write what waits, at most for `FLUSH_TIMEOUT_S`; later output is written without a thread."""
     deadline = time.monotonic() + FLUSH_TIMEOUT_S
     for stream in (sys.stdout, sys.stderr):
         with suppress(ValueError):

@@ -39,7 +39,8 @@ MAX_POLL_GAP_S = 0.5
 """Longest time between two polls that counts; during the rest the supervisor itself did not run."""
 HURRIED_GRACE_S = 1.0
 """Grace period of the nodes [s] after a second interrupt."""
-EXPECTED_STATUSES = (0, -signal.SIGINT, -signal.SIGTERM)
+EXPECTED_STATUSES = (0, -signal.SIGINT, -signal.SIGTERM, -signal.SIGALRM)
+"""SIGALRM ends a node whose work is done, and whose middleware hangs; see `lifecycle`."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Every node configures, activates, rests, cleans up and shuts down when it is told to."""
 
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from cutting_trainer.node_common.cdr_codec import WrenchStampedCodec
 from cutting_trainer.node_common.qos import NEWEST_BEST_EFFORT
 from cutting_trainer.node_common.ros import polled, take_raw
 from cutting_trainer.session.node_commands import MODULES, node_environment
+from cutting_trainer.session.supervisor import EXPECTED_STATUSES
 
 pytestmark = pytest.mark.long
 
@@ -178,3 +180,36 @@ def test_no_thread_of_the_middleware_outlives_a_node(end: str) -> None:
     counts = [int(line.split()[0]) for line in done.stdout.splitlines() if 'sockets' in line]
     assert done.returncode == (2 if end == 'fails' else 0), done
     assert counts[0] > 0 and counts[-1] == 0, done
+
+
+HANGS = """
+import ctypes, os, signal
+from cutting_trainer.node_common.lifecycle import ManagedNode, run
+
+class Hangs(ManagedNode):
+    def work(self, stop):
+        os.kill(os.getpid(), signal.SIGINT)
+        stop.wait()
+
+    def release(self):
+        print('work is done', flush=True)
+
+    def destroy_node(self):
+        ctypes.PyDLL(None).sleep(60)  # as the middleware does: no other thread of Python runs
+
+run(lambda: Hangs('hangs'))
+"""
+
+
+def test_a_node_ends_after_its_work_though_its_middleware_hangs() -> None:
+    command = [sys.executable, '-c', HANGS]
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=node_environment(free_domain()),
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert done.returncode == -signal.SIGALRM and done.returncode in EXPECTED_STATUSES, done
+    assert 'work is done' in done.stdout, done
