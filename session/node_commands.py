@@ -31,8 +31,8 @@ SESSION_PUBLISHERS = f'/{ARM_NODE},/{TISSUE_NODE}'
 OF_A_TOOL = (ARM_NODE, BRIDGE_NODE)
 """Nodes that each tool has."""
 WORK: dict[str, Work] = {
-    ARM_NODE: 'force loop',
-    BRIDGE_NODE: 'force loop',
+    ARM_NODE: 'arm',
+    BRIDGE_NODE: 'bridge',
     TISSUE_NODE: 'frames',
     RECORDER_NODE: 'messages',
 }

@@ -16,7 +16,7 @@ from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.processors import Work, reserved_processors, shared_out
 from cutting_trainer.session.supervisor import Supervisor
 
-SESSION: list[Work] = ['force loop', 'force loop', 'frames', 'messages', 'other']
+SESSION: list[Work] = ['arm', 'bridge', 'frames', 'messages', 'other']
 RECEIVES = """
 import ctypes, sys, threading, time
 
@@ -45,36 +45,51 @@ def own_address(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (SESSION, [0, 1], {1}, {0}),
         (SESSION, [2, 5, 6, 7], {7}, {2, 5, 6}),
-        (['force loop', *SESSION], [0, 1, 2], {1, 2}, {0}),
-        (['force loop', 'frames'], [0, 1], {1}, {0}),
+        (['bridge', *SESSION], [0, 1, 2], {1, 2}, {0}),
+        (['bridge', 'frames'], [0, 1], {1}, {0}),
     ],
 )
 def test_two_force_loops_share_a_processor_and_frames_get_the_others(
     work: list[Work], available: list[int], loops: set[int], frames: set[int]
 ) -> None:
-    expected = {'force loop': loops, 'messages': loops, 'frames': frames}
+    expected = {'bridge': loops, 'arm': loops, 'messages': loops, 'frames': frames}
     assert shared_out(work, available) == expected
 
 
+@pytest.mark.parametrize(
+    ('tools', 'available', 'arms'), [(2, [0, 1], {0}), (4, [0, 1, 2, 3], {0, 1}), (3, [4, 5], None)]
+)
+def test_arms_go_to_the_frames_where_too_few_processors_are_left(
+    tools: int, available: list[int], arms: set[int] | None
+) -> None:
+    found = shared_out(tools * ['arm', 'bridge'] + ['frames'], available)
+    assert found.get('arm') == arms
+    if arms is not None:
+        assert found['frames'] == arms and found['bridge'] == set(available) - arms
+
+
 @given(st.lists(st.sampled_from(SESSION), max_size=9), st.sets(st.integers(0, 63), min_size=1))
-def test_no_processor_has_both_and_each_kind_has_one_or_nothing_is_shared_out(
+def test_no_processor_has_too_many_loops_and_no_bridge_one_of_frames(
     work: list[Work], available: set[int]
 ) -> None:
     found = shared_out(work, sorted(available))
-    if found:
-        assert found['frames'] and found['force loop']
-        assert not found['frames'] & found['force loop']
-        assert found['frames'] | found['force loop'] == available
-        assert work.count('force loop') <= 2 * len(found['force loop'])
-    else:
-        missing = not {'force loop', 'frames'} <= set(work)
-        assert missing or work.count('force loop') > 2 * (len(available) - 1)
+    arms, bridges = work.count('arm'), work.count('bridge')
+    if not found:
+        room = 2 * (len(available) - 1)
+        assert 'frames' not in work or arms + bridges > room or not arms + bridges
+        return
+    assert found['frames'] and not found['frames'] & found['bridge']
+    assert found['frames'] | found['bridge'] == available
+    of_arms = found['arm']
+    with_bridges = bridges + (arms if of_arms == found['bridge'] else 0)
+    assert with_bridges <= 2 * len(found['bridge'])
+    assert arms <= 2 * len(of_arms)
 
 
 def test_each_node_has_the_work_that_it_does() -> None:
     nodes = session_nodes(Path('scene'), Path('bag'), 0, 1.0, ['grasper'])
     work = {node.name: node.work for node in nodes}
-    loops = {name for name, kind in work.items() if kind == 'force loop'}
+    loops = {name for name, kind in work.items() if kind in ('arm', 'bridge')}
     arms = {'emulated_arm', 'haptic_bridge'}
     assert loops == arms | {f'grasper/{name}' for name in arms}
     assert [name for name, kind in work.items() if kind == 'frames'] == ['tissue_sim']
@@ -94,7 +109,7 @@ def test_nodes_run_on_the_processors_of_their_work(tmp_path: Path) -> None:
     all_of_them = os.sched_getaffinity(0)
     with reserved_processors(SESSION) as reserved:
         expected = dict(reserved)
-    kinds: dict[str, Work] = {'arm': 'force loop', 'tissue': 'frames', 'cutting': 'other'}
+    kinds: dict[str, Work] = {'arm': 'arm', 'tissue': 'frames', 'cutting': 'other'}
     ledger = Ledger(tmp_path / 'ledger')
     nodes = [replace(command(name, ledger), work=kind) for name, kind in kinds.items()]
     with Supervisor(nodes, tmp_path / 'log', ENVIRONMENT) as supervisor:
@@ -112,7 +127,7 @@ def threads(pid: int) -> dict[str, set[int]]:
 
 @pytest.mark.usefixtures('own_address')
 def test_what_receives_messages_of_force_loops_is_on_their_processor(tmp_path: Path) -> None:
-    kinds: dict[str, Work] = {'arm': 'force loop', 'tissue': 'frames', 'cutting': 'other'}
+    kinds: dict[str, Work] = {'arm': 'arm', 'tissue': 'frames', 'cutting': 'other'}
     argv = (sys.executable, '-S', '-c', RECEIVES)
     nodes = [NodeCommand(name, (*argv, name), work=kind) for name, kind in kinds.items()]
     everywhere = os.sched_getaffinity(0)
@@ -121,6 +136,6 @@ def test_what_receives_messages_of_force_loops_is_on_their_processor(tmp_path: P
         assert supervisor.start()
         found = {name: threads(pid) for name, pid in supervisor.pids.items()}
     receivers = {name: by_thread.pop('dds.udp.7411') for name, by_thread in found.items()}
-    assert receivers['arm'] == receivers['tissue'] == expected.get('force loop', everywhere)
+    assert receivers['arm'] == receivers['tissue'] == expected.get('bridge', everywhere)
     assert [*found['tissue'].values()] == [expected.get('frames', everywhere)]
     assert receivers['cutting'] == everywhere
