@@ -106,6 +106,7 @@ class HapticBridge(ManagedNode):
         text = 'enter ENABLED, once, when device, force and surface are fresh'
         wanted = bool(parameter(self, 'auto_enable', False, text))
         name, names = tool_parameter(self), ('', *tool_names(scene))
+        number = names.index(name)
         device = read_section(scene, 'device', DeviceSettings, name)
         tool = read_section(scene, 'tool', ToolSettings, name)
         haptics = read_section(scene, 'haptics', HapticsSettings, name)
@@ -125,14 +126,14 @@ class HapticBridge(ManagedNode):
             resistance,
             friction,
             constants,
-            names.index(name),
+            number,
         )
         self._path.coupling.change(force_scale=felt)
         self._machine.start_anew()
         self._auto_enable = AutoEnable(self._machine, wanted=wanted)
         self._convention = DeviceConvention(device)
         self._watch = StreamMonitor(f'{ros.ARM}/measured_cp')
-        self._loop = PeriodicLoop(haptics.rate)
+        self._loop = PeriodicLoop(haptics.rate, phase=number / 2)
         self._latency = Durations('pose_to_force')
         self._real_time = 'the force loop has not started'
         self._faults, self._last_fault, self._was_faulty = 0, '', False

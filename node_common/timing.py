@@ -29,10 +29,13 @@ class PeriodicLoop:
     Args:
         rate: deadlines a second [Hz].
         window: periods covered by `report`.
+        phase: of the deadlines, as a share of the period [-]. Loops of one machine that share a
+            processor meet less often with different ones.
     """
 
-    def __init__(self, rate: float, *, window: int = 4096) -> None:
+    def __init__(self, rate: float, *, window: int = 4096, phase: float = 0.0) -> None:
         self.period_ns = round(NANOSECONDS / rate)
+        self._offset = round(phase * self.period_ns)
         self.missed = 0
         self.ticks = 0
         self._starts, self._lateness, self._busy = (_integers(window) for _ in range(3))
@@ -41,8 +44,9 @@ class PeriodicLoop:
         self._woken = 0
 
     def start(self) -> None:
-        """Set the first deadline one period from now."""
-        self._deadline = time.monotonic_ns() + self.period_ns
+        """Set the first deadline, at most one period from now."""
+        begun = (time.monotonic_ns() - self._offset) // self.period_ns
+        self._deadline = (begun + 1) * self.period_ns + self._offset
 
     def wait(self) -> int:
         """Sleep until the next deadline.

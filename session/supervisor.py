@@ -337,7 +337,8 @@ class Supervisor:
         if line == f'ready: {node.name}':
             node.ready, node.beat = True, self._lived
             if node.command.work in self._processors:
-                place_receivers(node.process.pid, self._processors['messages'])
+                whose: Work = 'messages' if node.command.work == 'messages' else 'bridge'
+                place_receivers(node.process.pid, self._processors[whose])
             self._emit(Event('ready', node.name, line))
         elif line == f'done: {node.name}':
             node.done = True

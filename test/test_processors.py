@@ -66,6 +66,7 @@ def test_arms_go_to_the_frames_where_too_few_processors_are_left(
     assert found.get('arm') == arms
     if arms is not None:
         assert found['frames'] == arms and found['bridge'] == set(available) - arms
+        assert found['messages'] == set(available)
 
 
 @given(st.lists(st.sampled_from(SESSION), max_size=9), st.sets(st.integers(0, 63), min_size=1))

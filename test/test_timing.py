@@ -53,6 +53,21 @@ def test_a_report_has_the_rate_lateness_and_work_of_each_period(clock: Clock) ->
     assert report['within'] == report['timely'] == 1.0
 
 
+@pytest.mark.parametrize('begun', [0, MS // 3, 2 * MS // 3])
+def test_loops_of_phases_half_a_period_apart_tick_half_a_period_apart(
+    clock: Clock, begun: int
+) -> None:
+    moments = []
+    for phase, at in ((0, 0), (1 / 2, begun), (2 / 2, begun)):
+        clock.now, clock.late = 10**12 + at, [0]
+        loop = PeriodicLoop(1000.0, phase=phase)
+        loop.start()
+        loop.wait()
+        assert 0 < clock.now - 10**12 - at <= MS
+        moments.append(clock.now % MS)
+    assert moments == [0, MS // 2, 0]
+
+
 def test_a_tick_that_oversleeps_misses_deadlines_and_makes_none_up(clock: Clock) -> None:
     loop = PeriodicLoop(1000.0)
     loop.start()

@@ -74,7 +74,7 @@ class OmniAdapter(ManagedNode):
         self._servo_cf = polled(self, WrenchStamped, f'{ARM}/servo_cf', NEWEST_BEST_EFFORT)
         self._state = polled(self, OmniState, 'omni/state', NEWEST_BEST_EFFORT)
         self.create_subscription(OmniButtonEvent, 'omni/button', self._press, EVENTS)
-        self._loop = PeriodicLoop(RATE_HZ)
+        self._loop = PeriodicLoop(RATE_HZ, phase=0.5)
 
     @property
     def progress(self) -> int:

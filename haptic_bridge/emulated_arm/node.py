@@ -48,7 +48,7 @@ from cutting_trainer.node_common.ros import (
     stamp,
     take_numbered,
 )
-from cutting_trainer.node_common.scene_reader import read_section
+from cutting_trainer.node_common.scene_reader import read_section, tool_names
 from cutting_trainer.node_common.stream_monitor import StreamMonitor
 from cutting_trainer.node_common.timing import Durations, PeriodicLoop
 
@@ -129,7 +129,8 @@ class ArmNode(ManagedNode):
         )
         if parameter(self, 'auto_enable', True, 'start in the state ENABLED'):
             self._machine.command('enable')
-        self._loop = PeriodicLoop(settings.rate)
+        number = ('', *tool_names(scene)).index(tool)
+        self._loop = PeriodicLoop(settings.rate, phase=(number + 1) / 2)
         self._force_age = Durations('force_age')
         self._missed = self._next_look = 0
         self._bridge_enabled = False
