@@ -1,10 +1,10 @@
 """Recorded inputs and results of each simulation frame."""
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -259,13 +259,14 @@ def _tool_records(bag: Bag, inputs: list[Any], tool: str) -> dict[int, ToolRecor
         tool: its namespace with a slash before it; '': the first.
     """
     used = {(m.contact_sequence, nanoseconds(m.contact_stamp)) for m in inputs if m.has_contact}
-    contacts = _samples(
-        bag, f'{tool}{CONTACT}', ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used
-    )
     pose, wanted = of_session(f'{tool}{POSE}', bag.topics()), {stamp for _, stamp in used}
-    poses = _samples(bag, pose, PoseStampedCodec(), lambda s: s.stamp_ns, wanted)
     stamps = {nanoseconds(m.header.stamp) for m in inputs}
-    forces = _samples(bag, f'{tool}{FORCE}', ForceSampleCodec(), lambda s: s.stamp_ns, stamps)
+    contacts, poses, forces = _samples(
+        bag,
+        _Wanted(f'{tool}{CONTACT}', ContactCodec(), lambda s: (s.values[0], s.stamp_ns), used),
+        _Wanted(pose, PoseStampedCodec(), lambda s: s.stamp_ns, wanted),
+        _Wanted(f'{tool}{FORCE}', ForceSampleCodec(), lambda s: s.stamp_ns, stamps),
+    )
     indexings = recorded_indexings(bag, tool)
     found = {}
     for m in inputs:
@@ -291,15 +292,32 @@ def contact_message(sample: StampedMessage) -> Any:
     return SimpleNamespace(**values)
 
 
-def _samples(
-    bag: Bag, topic: str, codec: Any, key: Any, wanted: set[Any]
-) -> dict[Any, StampedMessage]:
-    found = {}
-    for recorded in bag.messages([topic]):
+class _Wanted(NamedTuple):
+    """Messages of a topic that are to be found.
+
+    Attributes:
+        topic: that has them.
+        codec: of it.
+        key: returns the key of a message.
+        keys: of the messages.
+    """
+
+    topic: str
+    codec: Any
+    key: Callable[[StampedMessage], Any]
+    keys: set[Any]
+
+
+def _samples(bag: Bag, *wanted: _Wanted) -> list[dict[Any, StampedMessage]]:
+    """Return messages of some topics by their keys, from one pass through the bag."""
+    found: list[dict[Any, StampedMessage]] = [{} for _ in wanted]
+    by_topic = {one.topic: (one, samples) for one, samples in zip(wanted, found, strict=True)}
+    for recorded in bag.messages(by_topic.keys()):
+        one, samples = by_topic[recorded.topic]
         with contextlib.suppress(MessageError):  # no node has used such a message
-            sample = codec.decode(recorded.data)
-            if key(sample) in wanted:
-                found[key(sample)] = sample
+            sample = one.codec.decode(recorded.data)
+            if (key := one.key(sample)) in one.keys:
+                samples[key] = sample
     return found
 
 

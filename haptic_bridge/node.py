@@ -106,10 +106,10 @@ class HapticBridge(ManagedNode):
         text = 'enter ENABLED, once, when device, force and surface are fresh'
         wanted = bool(parameter(self, 'auto_enable', False, text))
         name, names = tool_parameter(self), ('', *tool_names(scene))
-        number = names.index(name)
         device = read_section(scene, 'device', DeviceSettings, name)
         tool = read_section(scene, 'tool', ToolSettings, name)
         haptics = read_section(scene, 'haptics', HapticsSettings, name)
+        number = names.index(name)
         profile = device.load_profile()
         text = 'hand force over tissue force [-], above 0 to 100'
         felt = parameter(self, 'force_scale', haptics.force_scale, text, settable=True)

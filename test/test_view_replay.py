@@ -182,6 +182,7 @@ def test_two_sessions_stand_side_by_side_and_their_hands_begin_together(
         assert apart == pytest.approx([reader.values['hello']['tissues'][1]['offset'][0], 0, 0])
         assert further['wxyz'] == pytest.approx(moment['wxyz'])
         assert len(reader.values['hello']['further_tools']) == 1
+        assert [shown['label'] for shown in reader.values['hello']['tissues']] == ['bag', 'bag']
         reader.close()
     finally:
         page.server.stop()

@@ -49,6 +49,11 @@ class Recording:
         self.end = duration(self.bag)
         self._translator = Translator(self.device)
 
+    @property
+    def name(self) -> str:
+        """Return the name of the session: that of the file, without the number of its part."""
+        return self.bag.path.stem.removesuffix('_0')
+
     @cached_property
     def depths(self) -> Floats:
         """Return the depth of the blade's end at each contact [m], shape (n,)."""
@@ -111,5 +116,6 @@ def recorded_beside(other: Recording, first: Recording) -> Beside:
     """Return another session to show beside the first, so that both hands begin together."""
     later = other.begin() - first.begin()
     times, forces = other.felt
-    name = other.bag.path.name
-    return Beside(name, other.tissue, (times - later, forces), other.end - later, other, later)
+    return Beside(
+        other.name, other.tissue, (times - later, forces), other.end - later, other, later
+    )

@@ -73,7 +73,7 @@ class ReplayPage:
         named, tools = '', []
         tissues, seen = [], [positions]
         if beside is not None:
-            named = 'recorded' if beside.recording is None else recording.bag.path.name
+            named = 'recorded' if beside.recording is None else recording.name
             colour = OTHER_TISSUE if beside.recording is None else TISSUE
             tissues.append(shown_tissue(BESIDE, beside.name, colour, float(self._apart[0])))
             seen.append(positions + self._apart)

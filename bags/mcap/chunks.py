@@ -6,7 +6,7 @@ such and in relation to its size in the file, before and while it is unpacked.
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -37,6 +37,7 @@ SMALL_FILE = 1 << 26
 _HEAD = struct.Struct('<BQ')
 MESSAGE_HEAD = struct.Struct('<HIQQ')
 """Channel, sequence, log time and publish time, before the data of a message."""
+_CHANNEL = struct.Struct('<H')
 _PIECE = 1 << 16
 
 McapRecord = Schema | Channel | Message
@@ -157,23 +158,33 @@ def _unpack_lz4(data: bytes, limit: int) -> tuple[bytes, bool]:
     return bytes(out), decompressor.eof
 
 
-def records(data: bytes) -> Iterator[tuple[int, McapRecord]]:
+def records(
+    data: bytes, channels: Collection[int] | None = None
+) -> Iterator[tuple[int, McapRecord]]:
     """Yield the schemas, channels and messages of an unpacked chunk, with their places in it.
+
+    Args:
+        data: of the chunk.
+        channels: numbers of those whose messages are yielded; None: all.
 
     Raises:
         ChunkError: a record is invalid, or there are too many.
     """
-    at = count = 0
-    while at < len(data):
+    at, count, size = 0, 0, len(data)
+    while at < size:
         place, count = at, count + 1
         if count > MAX_RECORDS:
             raise ChunkError(f'a chunk has more than {MAX_RECORDS} records')
-        if at + _HEAD.size > len(data):
+        if at + _HEAD.size > size:
             raise ChunkError('a chunk ends within a record')
         opcode, length = _HEAD.unpack_from(data, at)
         at += _HEAD.size + length
-        if at > len(data):
+        if at > size:
             raise ChunkError('a chunk ends within a record')
+        if channels is not None and opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
+            (channel,) = _CHANNEL.unpack_from(data, place + _HEAD.size)
+            if channel not in channels:
+                continue
         record = read_record(opcode, data[place + _HEAD.size : at])
         if record is not None:
             yield place, record

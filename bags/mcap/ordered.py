@@ -42,7 +42,7 @@ def in_order(
     room = UnpackBudget(file.path, file.size)
     while waiting or unpacked:
         while waiting and (not unpacked or waiting[0].start <= unpacked[0].messages[0].log_time):
-            chunk = _OpenChunk(chunk_at(file, waiting.popleft(), room), channels, since)
+            chunk = _OpenChunk(chunk_at(file, waiting.popleft(), room, channels), since)
             if chunk.messages:
                 heapq.heappush(unpacked, chunk)
             _check_room(unpacked)
@@ -79,17 +79,9 @@ class _OpenChunk:
         size: of it [bytes].
     """
 
-    def __init__(
-        self, chunk: tuple[int, list[McapRecord]], channels: Collection[int] | None, since: int
-    ) -> None:
+    def __init__(self, chunk: tuple[int, list[McapRecord]], since: int) -> None:
         self._offset, found = chunk
-        kept = [
-            m
-            for m in found
-            if isinstance(m, Message)
-            and (channels is None or m.channel_id in channels)
-            and m.log_time >= since
-        ]
+        kept = [m for m in found if isinstance(m, Message) and m.log_time >= since]
         kept.sort(key=lambda m: m.log_time)
         self.messages = deque(kept)
         self.size = sum(len(m.data) for m in kept)
@@ -99,13 +91,16 @@ class _OpenChunk:
         return own < others or (own == others and self._offset < other._offset)
 
 
-def chunk_at(file: McapFile, index: ChunkPlace, room: UnpackBudget) -> tuple[int, list[McapRecord]]:
+def chunk_at(
+    file: McapFile, index: ChunkPlace, room: UnpackBudget, channels: Collection[int] | None = None
+) -> tuple[int, list[McapRecord]]:
     """Return the offset of a chunk in its file, and its records.
 
     Args:
         file: with the chunk.
         index: of it.
         room: counter of unpacked bytes.
+        channels: numbers of those whose messages are returned; None: all.
 
     Raises:
         BagError: there is none, it is damaged, or too large.
@@ -120,4 +115,4 @@ def chunk_at(file: McapFile, index: ChunkPlace, room: UnpackBudget) -> tuple[int
         raise ChunkError(f'the chunk at byte {offset} cannot be unpacked')
     if unpacked.wrong:
         raise ChunkError(f'the checksum of the chunk at byte {offset} does not hold')
-    return offset, [record for _, record in records(unpacked.data)]
+    return offset, [record for _, record in records(unpacked.data, channels)]
