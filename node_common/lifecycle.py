@@ -278,12 +278,14 @@ def run(make_node: Callable[[], ManagedNode]) -> Any:
     except ValueError as error:
         problem = str(error)  # the error itself holds the node
     if node is None or problem is not None:
+        print(f'error: {problem}', file=sys.stderr, flush=True)
+        _limit_end()
         if node is not None:
             node.destroy_node()
         node = None
         gc.collect()  # a node whose making failed
-        print(f'error: {problem}', file=sys.stderr, flush=True)
         rclpy.shutdown()
+        signal.alarm(0)
         raise SystemExit(2)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -300,13 +302,19 @@ def run(make_node: Callable[[], ManagedNode]) -> Any:
         try:
             node.end()
         finally:
-            output.close()
-            signal.signal(signal.SIGALRM, signal.SIG_DFL)
-            signal.alarm(_DESTROY_TIMEOUT_S)
+            _limit_end()
             node.destroy_node()
             rclpy.shutdown()
             signal.alarm(0)
     return node
+
+
+def _limit_end() -> None:
+    """Write what waits, and let the process end if the middleware then hangs."""
+    output.close()
+    if sys.exc_info()[0] is None:  # an error is yet to be told, and is no end in order
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(_DESTROY_TIMEOUT_S)
 
 
 def _start(node: ManagedNode) -> None:

@@ -183,10 +183,14 @@ def test_no_thread_of_the_middleware_outlives_a_node(end: str) -> None:
 
 
 HANGS = """
-import ctypes, os, signal
+import ctypes, os, signal, sys
 from cutting_trainer.node_common.lifecycle import ManagedNode, run
 
 class Hangs(ManagedNode):
+    def configure(self):
+        if 'fails' in sys.argv:
+            raise ValueError('it is to fail')
+
     def work(self, stop):
         os.kill(os.getpid(), signal.SIGINT)
         stop.wait()
@@ -201,8 +205,11 @@ run(lambda: Hangs('hangs'))
 """
 
 
-def test_a_node_ends_after_its_work_though_its_middleware_hangs() -> None:
-    command = [sys.executable, '-c', HANGS]
+@pytest.mark.parametrize(
+    ('end', 'said'), [('interrupted', 'work is done'), ('fails', 'error: it is to fail')]
+)
+def test_a_node_ends_and_says_all_though_its_middleware_hangs(end: str, said: str) -> None:
+    command = [sys.executable, '-c', HANGS, end]
     done = subprocess.run(
         command,
         cwd=ROOT,
@@ -212,4 +219,4 @@ def test_a_node_ends_after_its_work_though_its_middleware_hangs() -> None:
         timeout=30,
     )
     assert done.returncode == -signal.SIGALRM and done.returncode in EXPECTED_STATUSES, done
-    assert 'work is done' in done.stdout, done
+    assert said in done.stdout + done.stderr, done

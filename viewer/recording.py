@@ -51,8 +51,9 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """Return the name of the session: that of the file, without the number of its part."""
-        return self.bag.path.stem.removesuffix('_0')
+        """Return the name of the session: of its folder if split, or of its file."""
+        path = self.bag.path
+        return path.name if path.is_dir() else path.stem.removesuffix('_0')
 
     @cached_property
     def depths(self) -> Floats:
