@@ -312,7 +312,7 @@ def _samples(bag: Bag, *wanted: _Wanted) -> list[dict[Any, StampedMessage]]:
     """Return messages of some topics by their keys, from one pass through the bag."""
     found: list[dict[Any, StampedMessage]] = [{} for _ in wanted]
     by_topic = {one.topic: (one, samples) for one, samples in zip(wanted, found, strict=True)}
-    for recorded in bag.messages(by_topic.keys()):
+    for recorded in bag.messages(by_topic):
         one, samples = by_topic[recorded.topic]
         with contextlib.suppress(MessageError):  # no node has used such a message
             sample = one.codec.decode(recorded.data)

@@ -336,9 +336,8 @@ class Supervisor:
             return
         if line == f'ready: {node.name}':
             node.ready, node.beat = True, self._lived
-            if node.command.work in self._processors:
-                whose: Work = 'messages' if node.command.work == 'messages' else 'bridge'
-                place_receivers(node.process.pid, self._processors[whose])
+            if self._processors and node.command.work in ('arm', 'frames'):
+                place_receivers(node.process.pid, self._processors['bridge'])
             self._emit(Event('ready', node.name, line))
         elif line == f'done: {node.name}':
             node.done = True

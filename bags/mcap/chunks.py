@@ -37,7 +37,6 @@ SMALL_FILE = 1 << 26
 _HEAD = struct.Struct('<BQ')
 MESSAGE_HEAD = struct.Struct('<HIQQ')
 """Channel, sequence, log time and publish time, before the data of a message."""
-_CHANNEL = struct.Struct('<H')
 _PIECE = 1 << 16
 
 McapRecord = Schema | Channel | Message
@@ -181,10 +180,13 @@ def records(
         at += _HEAD.size + length
         if at > size:
             raise ChunkError('a chunk ends within a record')
-        if channels is not None and opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
-            (channel,) = _CHANNEL.unpack_from(data, place + _HEAD.size)
-            if channel not in channels:
-                continue
+        if (
+            channels is not None
+            and opcode == Opcode.MESSAGE
+            and length >= MESSAGE_HEAD.size
+            and MESSAGE_HEAD.unpack_from(data, place + _HEAD.size)[0] not in channels
+        ):
+            continue
         record = read_record(opcode, data[place + _HEAD.size : at])
         if record is not None:
             yield place, record

@@ -92,7 +92,7 @@ class _OpenChunk:
 
 
 def chunk_at(
-    file: McapFile, index: ChunkPlace, room: UnpackBudget, channels: Collection[int] | None = None
+    file: McapFile, index: ChunkPlace, room: UnpackBudget, channels: Collection[int] | None
 ) -> tuple[int, list[McapRecord]]:
     """Return the offset of a chunk in its file, and its records.
 
