@@ -13,6 +13,8 @@ _MAX_DEEPER = 2.0
 """Factor by which the blade may be longer in the tissue than at the newest sample."""
 _MIN_SHARE = 0.05
 """Share of the whole stiffness below which a force does not fall as the edge goes on."""
+_MIN_HELD = 0.01
+"""Share of a slip that is left of it where the tissue springs back, before `_way_out` bounds it."""
 _MIN_SINE = 0.1
 """Sine of the angle between force and edge below which it says nothing of the cutting force."""
 
@@ -57,8 +59,9 @@ def pull_blade(
 
     The edge goes on in the tissue, along the force, where the force exceeds the resistance:
     pulled along itself, it meets friction alone. A part that has left the tissue feels nothing: the
-    force is in proportion to the length that is still in it. A sample says where the edge was at
-    its time; from there, the way of the tool is followed again.
+    force is in proportion to the length that is still in it. Where two samples show that the blade
+    slips out, that length follows from the way of the tool. A sample says where the edge was at its
+    time; from there, the way of the tool is followed again.
     """
     c, s = setup[0], state[0]
     length = _length_in_tissue(setup, history)
@@ -68,6 +71,8 @@ def pull_blade(
         _force_after(setup, state, history, step / steps, out, torque)
         if _go_on(setup, state, history, length, out):
             _force_after(setup, state, history, step / steps, out, torque)
+    if history[0].leaving > 0.0:
+        s.out = _share_slipped_out(setup, state, history)
     left = min(1.0 - s.out, 1.0)
     for k in range(3):
         # The coupling is as stiff as its scene says where half of the blade is in the tissue.
@@ -131,13 +136,45 @@ def _go_on(
     drop, step = size - limit, min(stiffness * c.crack_length, limit - c.blade_friction * length)
     if step > 0.0:
         drop = np.ceil(drop / step) * step
-    along, before = 0.0, 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
+    along = 0.0
     for k in range(3):
         s.advanced[k] -= drop / stiffness * force[k] / size
         along += s.advanced[k] * (s.arms[0, k] - s.arms[1, k]) / c.length
-    left = max(h.leaving, 1.0) * along / before if before > 0.0 else 0.0
+    if along > 0.0:
+        # What is still in the tissue bears less: the tissue springs back, and more of it slips out.
+        soft = max(scale / stiffness - 0.5 * c.length / (c.coupling * length), 0.0)
+        cosine = max(_cosine(force, s.arms[1] - s.arms[0]), 0.0)
+        held = max(1.0 - soft * limit * cosine / length, _MIN_HELD)
+        along = max(along, min(along / held, _way_out(setup, state, history)))
+    before = 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
+    left = along / before if before > 0.0 else 0.0
     s.out = min(max(left, 1.0 - _MAX_DEEPER), 1.0)
     return True
+
+
+@inner
+def _way_out(setup: np.ndarray, state: np.ndarray, history: np.ndarray) -> float:
+    """Return how far the tool has been drawn out along its blade since the newest sample [m]."""
+    s, way = state[0], 0.0
+    for k in range(3):
+        axis = (s.arms[0, k] - s.arms[1, k]) / setup[0].length
+        way += (s.tip[k] - history[0].position[1, k]) * axis
+    return max(way, 0.0)
+
+
+@inner
+def _share_slipped_out(setup: np.ndarray, state: np.ndarray, history: np.ndarray) -> float:
+    """Return the share of the length in the tissue that a blade that slips out has left behind.
+
+    By way of the tool, `leaving` leaves at the sample, and then in inverse proportion to what is
+    still in it: the shorter the edge, the farther its load moves the tissue, which springs back.
+    """
+    h = history[0]
+    before = 2.0 * h.immersed[0] * setup[0].length  # its tip is in the tissue
+    if before <= 0.0:
+        return 1.0
+    left = h.leaving * _way_out(setup, state, history) / before
+    return 1.0 - np.sqrt(max(1.0 - 2.0 * left, 0.0))
 
 
 @inner

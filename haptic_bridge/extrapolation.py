@@ -401,6 +401,7 @@ def _push(
     history, time, topology, state, position, force, torque, stiffness, depth, arms, immersed
 ):
     h = history[0]
+    goes_on = h.count > 0 and h.state == state and immersed[1] > 0.0
     same = h.topology == topology and h.state == state
     h.count = min(h.count + 1, 2) if same else 1
     h.time[0] = h.time[1]
@@ -416,9 +417,8 @@ def _push(
     given = np.any(stiffness)
     if given:
         h.stiffness[:] = 0.5 * (stiffness + stiffness.T) if immersed[1] > 0.0 else stiffness
-    of_blade = h.count == 2 and immersed[1] > 0.0
-    h.leaving = _leaving(history, arms, immersed) if of_blade else 0.0
-    if of_blade and h.leaving == 0.0 and given:
+    h.leaving = _leaving(history, arms, immersed) if goes_on else 0.0
+    if goes_on and h.count == 2 and h.leaving == 0.0 and given:
         _stiffen(history, arms, immersed)
     h.arms[:] = arms
     h.immersed[:] = immersed

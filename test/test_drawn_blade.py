@@ -6,6 +6,7 @@ from rig import FRAME, RADIUS, Rig, lowered, spoiled
 
 from bench.haptics.random_cuts import errors_of
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
+from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.tissue_sim.contact.blade_constants import BladeConstants
 
 DEEP = RADIUS - 4e-3
@@ -57,12 +58,12 @@ def test_a_loaded_blade_takes_the_tissue_along_until_both_forces_together_cut() 
     forces = drawn(loaded(LOAD), way)
     sizes, across = np.linalg.norm(forces, axis=1), np.abs(forces[:, 0])
     # What the tissue bears is J l sin(edge, force) + friction l, and sin(edge, force) = across / F.
-    bound = IMMERSED * (TOUGHNESS * across / sizes + FRICTION)
-    yields = int(np.argmax(sizes > 0.995 * bound))
+    bound = IMMERSED * (TOUGHNESS * across + FRICTION * sizes)
+    yields = int(np.argmax(sizes**2 > 0.99 * bound))
     assert 20 < yields < 50
     np.testing.assert_allclose(across[:yields], LOAD, rtol=1e-3)
     np.testing.assert_allclose(forces[:yields, 2], -STIFFNESS * way[:yields], atol=2e-3)
-    assert (sizes <= 1.01 * bound).all()
+    assert (sizes**2 <= 1.01 * bound).all()
     assert sizes[-1] < 0.8 * sizes[yields]
 
 
@@ -71,9 +72,33 @@ def test_a_blade_without_load_is_drawn_out_against_its_friction_alone() -> None:
     forces = drawn(loaded(0.0), way)
     rubs = np.abs(forces[:, 2])
     assert rubs.max() == pytest.approx(FRICTION * IMMERSED, rel=0.02)
-    # It is in proportion to the length that is still in the tissue.
-    left = IMMERSED - way[-1] + FRICTION * IMMERSED / STIFFNESS
-    assert rubs[-1] == pytest.approx(FRICTION * left, rel=0.1)
+    # It is in proportion to the length that is still in the tissue, and so is the stiffness of the
+    # coupling: its stretch stays, that of the tissue falls with the force.
+    stretch = FRICTION * LENGTH / 2 / TOOL.coupling_stiffness
+    soft = 1 / STIFFNESS - stretch / (FRICTION * IMMERSED)
+    left = (IMMERSED - way[-1] + stretch) / (1 - soft * FRICTION)
+    assert rubs[-1] == pytest.approx(FRICTION * left, rel=0.01)
+
+
+def test_a_blade_that_slips_out_leaves_the_faster_the_less_of_it_is_in_the_tissue() -> None:
+    rig = loaded(LOAD)
+    still = rig.spoil
+
+    def told(sample: StampedMessage) -> StampedMessage:
+        mean = (IMMERSED - (sample.values[9] - DEEP)) / LENGTH / 2
+        return spoiled(still(sample), immersed=(mean, mean**2 * 4 / 3))
+
+    rig.spoil, rig.sim = told, True
+    drawn(rig, np.linspace(0.0, 2e-3, 2 * FRAME + 1))  # by as much as it is drawn, two samples say
+    rig.sim = False
+    way = 2e-3 + np.linspace(0.0, 6e-3, 121)
+    sizes = np.linalg.norm(drawn(rig, way), axis=1)
+    # The newest sample is of 1 to 2 mm. At its rate, all would be out at 8 mm.
+    gone = int(np.argmax(sizes == 0.0))
+    assert 4.4e-3 < way[gone] < 5.1e-3
+    falls = -np.diff(sizes[:gone])
+    assert (np.diff(falls) > 0.0).all()
+    assert falls[-1] > 3.0 * falls[0]
 
 
 def test_tissue_that_two_samples_show_to_be_stiffer_is_felt_so_from_then_on() -> None:

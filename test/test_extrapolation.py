@@ -260,6 +260,19 @@ def test_a_cut_or_another_contact_state_makes_older_samples_void(change):
     np.testing.assert_array_equal(estimate(ex.TIME, h, ns(3 * FRAME), [0, 0, 0]), [0, 0, 0.9])
 
 
+@pytest.mark.parametrize(
+    ('change', 'leaving'), [({}, 1.5), ({'topology': 2}, 1.5), ({'state': 3}, 0.0)]
+)
+def test_a_blade_leaves_as_two_samples_say_though_a_cut_lies_between_them(change, leaving):
+    h, zero = np.zeros(1, ex.HISTORY), np.zeros(3)
+    arms = np.array([[0.0, 0.0, 0.020], [0.0, 0.0, 0.0]])
+    for z, inside, changed in ((0.0, 0.010, {}), (0.002, 0.007, change)):
+        places = np.array([inside / 0.040, (inside / 0.020) ** 2 / 3])
+        where = {'topology': 1, 'state': 2} | changed
+        ex.push(h, 0, [0, 0, z], zero, np.eye(3), zero, arms=arms, immersed=places, **where)
+    assert h['leaving'][0] == pytest.approx(leaving)
+
+
 def test_stiffness_outlives_a_sample_without_one():
     h = np.zeros(1, ex.HISTORY)
     push(h, 0, [0, 0, 0], [0, 0, 0], 30.0, topology=1, state=1)
