@@ -156,3 +156,15 @@ def first_time(bag: Bag) -> int:
 def duration(bag: Bag) -> float:
     """Return the time from the first message to the last [s]."""
     return (bag.span[1] - first_time(bag)) * 1e-9
+
+
+def require_moment(bag: Bag, seconds: float) -> None:
+    """Reject a moment [s] that a bag does not have.
+
+    Raises:
+        BagError: it is before the bag or after it.
+    """
+    end = duration(bag)
+    if not 0.0 <= seconds <= end:
+        said = f'{bag.path.parent} lasts from 0 to {end:.3f} s'
+        raise BagError(f'{said}: there is no tissue at {seconds:g} s')

@@ -116,6 +116,9 @@ def repair_bag(folder: Path) -> Repair:
             writer = BagWriter(temporary / folder.resolve().name, custom_data=data)
             result, refused = _write(salvage, writer)
         result.flaw = wrong
+        missing = _promised(folder) - writer.tally.messages
+        if missing > 0:
+            result.lost = max(result.lost or 0, missing)
         start = writer.tally.start
         result.lost_spans = [((a - start) * 1e-9, (b - start) * 1e-9) for a, b in result.lost_spans]
         data[_REPAIRED] = _noted(data.get(_REPAIRED, ''), result)
@@ -134,6 +137,15 @@ def repair_bag(folder: Path) -> Repair:
     result.seconds = (tally.end - tally.start) * 1e-9
     result.silence = max(modified - tally.end * 1e-9, 0.0) if tally.end else 0.0
     return result
+
+
+def _promised(folder: Path) -> int:
+    """Return how many messages the metadata of a bag name; 0: they name none."""
+    try:
+        count = read_metadata(folder).get('message_count')
+    except BagError:
+        return 0
+    return count if isinstance(count, int) else 0
 
 
 def _noted(before: str, result: Repair) -> str:

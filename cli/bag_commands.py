@@ -253,6 +253,11 @@ def attempts(
     bags = folder or SESSIONS
     if folder is not None and not folder.is_dir():
         raise SessionError(f'{folder} is no folder: name one with bags in it')
+    if delete and (subject or exercise or compare or curves or output is not None):
+        raise SessionError(
+            '--delete takes all attempts of a subject: leave --subject, --exercise, --compare, '
+            '--curves and --output out'
+        )
     console, store = Console(), open_store(bags)
     with _working('reading new bags'):
         for problem in of.index_bags(store, bags):

@@ -13,6 +13,13 @@ from cutting_trainer.session.errors import SessionError
 commands = typer.Typer()
 
 
+def _given(context: typer.Context, *parameters: str) -> list[str]:
+    """Return the options among some parameters of a command that its user has given."""
+    known = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    sources = {name: context.get_parameter_source(name) for name in parameters}
+    return [known[name] for name, of in sources.items() if of and of.name == 'COMMANDLINE']
+
+
 @commands.command(epilog=EXIT_STATUSES)
 def demo(
     scene: SceneOption = 'liver',
@@ -49,6 +56,7 @@ def demo(
 
 @commands.command(epilog=EXIT_STATUSES)
 def view(
+    context: typer.Context,
     scene: SceneOption = 'liver',
     host: Annotated[
         str,
@@ -103,6 +111,8 @@ def view(
 
         if beside is not None and (resimulate or changes):
             raise SessionError('--beside shows another bag: leave out --resimulate and --with')
+        if given := _given(context, 'scene', 'attach', 'arm', 'records', 'seed', 'domain'):
+            raise SessionError(f'--bag shows a recorded session: leave {" and ".join(given)} out')
         replayed = ReplayOptions(
             bag, resimulate, parse_changes(changes or []), host, port, allow_host or (), beside
         )

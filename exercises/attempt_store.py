@@ -19,6 +19,10 @@ CREATE TABLE IF NOT EXISTS attempts (
 CREATE INDEX IF NOT EXISTS by_subject ON attempts (subject, exercise, begun);
 """
 _PSEUDONYM_BYTES = 3
+SUBJECT = r'^[A-Za-z0-9_.-]*$'
+"""Pattern of pseudonyms."""
+MAX_ATTEMPT = 10**9
+"""Largest number of an attempt."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,18 @@ class AttemptRow:
     notes: str = ''
     reasons: tuple[str, ...] = ()
     measures: dict[str, float] = field(default_factory=dict)
+
+
+def attempt_number(text: str) -> int:
+    """Return the number of an attempt that a bag names; 0: none.
+
+    Raises:
+        ValueError: it is larger than an attempt can be.
+    """
+    number = int(text) if text.isdecimal() else 0
+    if number > MAX_ATTEMPT:
+        raise ValueError(f'its attempt {number} is above {MAX_ATTEMPT}')
+    return number
 
 
 def new_pseudonym() -> str:

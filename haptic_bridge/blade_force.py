@@ -166,8 +166,8 @@ def _way_out(setup: np.ndarray, state: np.ndarray, history: np.ndarray) -> float
 def _share_slipped_out(setup: np.ndarray, state: np.ndarray, history: np.ndarray) -> float:
     """Return the share of the length in the tissue that a blade that slips out has left behind.
 
-    By way of the tool, `leaving` leaves at the sample, and then in inverse proportion to what is
-    still in it: the shorter the edge, the farther its load moves the tissue, which springs back.
+    By way of the tool, `leaving` leaves at the sample, and then in inverse proportion to the rest:
+    the shorter the edge, the farther its load moves the tissue, which springs back.
     """
     h = history[0]
     before = 2.0 * h.immersed[0] * setup[0].length  # its tip is in the tissue

@@ -111,9 +111,9 @@ class HapticBridge(ManagedNode):
         haptics = read_section(scene, 'haptics', HapticsSettings, name)
         number = names.index(name)
         profile = device.load_profile()
-        text = 'hand force over tissue force [-], above 0 to 100'
+        text = 'hand force over tissue force [-], 0.001 to 100'
         felt = parameter(self, 'force_scale', haptics.force_scale, text, settable=True)
-        text, scale = 'tool motion over hand motion [-], above 0 to 100', device.tissue_from_device
+        text, scale = 'tool motion over hand motion [-], 0.001 to 100', device.tissue_from_device
         device = scaled(device, parameter(self, 'motion_scale', scale.scale, text, settable=True))
         resistance, friction, constants = of_tissue(scene)
         warm_up(tool, device, haptics, profile, friction)

@@ -17,6 +17,13 @@ from cutting_trainer.node_common.yaml_bounds import YamlBoundError
 from cutting_trainer.tissue_sim.contact.tool import MIN_RADIUS_M
 
 Vector = tuple[float, float, float]
+Coordinate = Annotated[float, Field(ge=-10, le=10)]
+"""[m]"""
+Place = tuple[Coordinate, Coordinate, Coordinate]
+Angle = Annotated[float, Field(ge=-360, le=360)]
+"""[deg]"""
+Angles = tuple[Angle, Angle, Angle]
+NodeName = Annotated[str, Field(pattern=r'^/[A-Za-z_][A-Za-z0-9_/]*$')]
 Edge = Annotated[float, Field(gt=0, le=5)]
 _MIN_SINE = 0.01
 """Of the angle between a blade and the direction that its edge faces."""
@@ -33,10 +40,10 @@ class ToolSettings(SceneModel):
         0.004, ge=MIN_RADIUS_M, le=0.05, description='[m] of the sphere that touches'
     )
     coupling_stiffness: Stiffness = DEFAULT_STIFFNESS_N_M
-    blade_root: Vector = Field(
+    blade_root: Place = Field(
         (0.0, 0.0, 0.02), description='[m] end of the cutting edge at the handle, tool frame'
     )
-    blade_tip: Vector = Field(
+    blade_tip: Place = Field(
         (0.0, 0.0, -0.004), description='[m] end of the cutting edge at the tip, tool frame'
     )
     blade_facing: Vector = Field(
@@ -76,11 +83,11 @@ class ToolSettings(SceneModel):
 class Transform(SceneModel):
     """Device frame to tissue frame: tissue = translation + rotation(scale * device)."""
 
-    translation: Vector = Field((0.0, 0.0, 0.0), description='[m] of the device origin')
-    rotation_rpy_deg: Vector = Field(
+    translation: Place = Field((0.0, 0.0, 0.0), description='[m] of the device origin')
+    rotation_rpy_deg: Angles = Field(
         (0.0, 0.0, 0.0), description='[deg] roll, pitch, yaw about the fixed axes x, y, z'
     )
-    scale: float = Field(1.0, gt=0, le=100, description='tissue motion over device motion')
+    scale: float = Field(1.0, ge=0.001, le=100, description='tissue motion over device motion')
 
     def rotation(self) -> np.ndarray:
         """Return the rotation from the device frame to the tissue frame, shape (3, 3)."""
@@ -153,7 +160,7 @@ class DeviceSettings(SceneModel):
         'scissors become a scalpel; 0.1 above it they open, or become a palpator. Without it the '
         'jaws are not followed',
     )
-    accepted_publishers: tuple[str, ...] = Field(
+    accepted_publishers: tuple[NodeName, ...] = Field(
         (),
         max_length=32,
         description='nodes, as /name, that alone may publish poses, forces and meshes for the '
@@ -262,7 +269,7 @@ class HapticsSettings(SceneModel):
     soft_start: float = Field(
         0.5, ge=0.0, le=10.0, description='[s] in which the force ceiling grows to max_force'
     )
-    force_scale: float = Field(1.0, gt=0, le=100, description='hand force over tissue force')
+    force_scale: float = Field(1.0, ge=0.001, le=100, description='hand force over tissue force')
     max_damping: float = Field(
         5.0, ge=0, le=100, description='[N s/m] largest of the passivity controller; 0 turns it off'
     )

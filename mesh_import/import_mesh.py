@@ -152,6 +152,8 @@ def _files(output: Path) -> tuple[Path, Path]:
             f'--output {output}: give a name without an extension, {output.with_suffix("")}; '
             'NAME.msh and NAME.yaml are written'
         )
+    if not output.name:
+        raise SessionError('--output is empty: give a name without an extension, as my_organ')
     files = output.with_name(f'{output.name}.msh'), output.with_name(f'{output.name}.yaml')
     for file in files:
         if file.exists():

@@ -1,5 +1,6 @@
 """Scene of an imported organ: fixed nodes, and a tool that starts above it and cuts it."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -152,8 +153,8 @@ def scene_text(
     press = radius / 2
     free = max(heights) - min(heights) + 4 * radius
     return _SCENE.format(
-        mesh=mesh,
-        source=source,
+        mesh=json.dumps(mesh, ensure_ascii=False),
+        source=' '.join(source.split()),
         nodes=len(nodes),
         tetrahedra=len(tetrahedra),
         edge=1e3 * edge,

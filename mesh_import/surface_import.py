@@ -84,6 +84,10 @@ def _load(path: Path) -> Any:
     # Readers raise exceptions of any type.
     except Exception as error:
         reason = ' '.join(str(error).split())[:150] or type(error).__name__
+        if isinstance(error, ImportError):
+            reason = 'its content is of no format that is known, or cut off'
+        elif isinstance(error, KeyError):
+            reason = f'it lacks {reason}'
         known = 'export it as STL, PLY or OBJ, with the extension of its format'
         raise SessionError(f'{path} cannot be read as a surface: {reason}; {known}') from None
 

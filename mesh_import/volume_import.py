@@ -63,10 +63,10 @@ def read_volume(path: Path, unit: str, edge: float | None) -> Volume:
     Raises:
         SessionError: one sentence with the file, the defect, and its remedy.
     """
-    if edge is not None:
-        raise SessionError(f'{path} holds tetrahedra, which stay as they are: leave --edge out')
     try:
         nodes, tetrahedra, labels = load_labelled_mesh(path, UNIT_SCALE[unit])
+        if edge is not None:
+            raise MeshError('it holds tetrahedra, which stay as they are: leave --edge out')
         if (count := len(np.unique(labels))) > MAX_REGIONS + 1:
             raise MeshError(
                 f'{count} labels: a scene takes {MAX_REGIONS} regions and the rest; join some'

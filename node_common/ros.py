@@ -9,6 +9,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy._rclpy_pybind11 import RMWError
 from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
@@ -182,7 +183,9 @@ class Diagnostics:
         self._collect = collect
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, EVENTS)
         self._spoke = time.monotonic()
-        self._timer = node.create_timer(1.0, self.publish)
+        # A clock of its own: with `use_sim_time` that of the node may stand still.
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(1.0, self.publish, clock=clock)
 
     def catch_up(self) -> None:
         """Publish if the executor is late; for a loop that computes much.

@@ -38,7 +38,7 @@ TOOLS = 'tools'
 each replace those of the sections of the first tool."""
 OF_A_TOOL = ('tool', 'device', 'haptics', 'arm')
 """Sections that a further tool may change."""
-_TOOL_NAME = re.compile(r'[a-z][a-z0-9_]{0,31}')
+_TOOL_NAME = re.compile(r'(?!.*__)[a-z][a-z0-9_]{0,31}')
 _TAKEN = (
     *('tissue', 'tool', 'arm', 'cutting', 'viewer', 'recorder', 'replay', 'diagnostics'),
     *('haptic_bridge', 'emulated_arm', 'tissue_sim', 'tf_static', 'rosout', 'parameter_events'),

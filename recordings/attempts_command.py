@@ -23,6 +23,7 @@ from cutting_trainer.exercises.attempt_store import (
     AttemptRow,
     AttemptStore,
     LearningCurve,
+    attempt_number,
     learning_curves,
 )
 from cutting_trainer.exercises.bag_feed import read_attempt
@@ -72,9 +73,9 @@ def attempt_of(folder: Path, store: AttemptStore) -> AttemptRow | None:
     if scene is None or not scene.exercise.title:
         return None
     data = bag.custom_data
-    subject, exercise = data.get('subject', 'unknown'), scene.name
-    number = data.get('attempt', '')
-    attempt = int(number) if number.isdigit() and int(number) else 0
+    subject = ''.join(filter(str.isprintable, data.get('subject', 'unknown')))
+    exercise = scene.name
+    attempt = attempt_number(data.get('attempt', ''))
     row = AttemptRow(
         bag=str(folder),
         subject=subject,
@@ -201,10 +202,11 @@ def export_rows(rows: Sequence[AttemptRow], file: Path) -> None:
 
 
 def delete(store: AttemptStore, folder: Path, subject: str) -> list[str]:
-    """Delete a subject: rows of the index, and the bags in the indexed folder.
+    """Delete a subject: the bags in the indexed folder, then rows of the index.
 
     Raises:
-        SessionError: the index has no attempt of that subject, or one is recorded now.
+        SessionError: the index has no attempt of that subject, one is recorded now, or one is a
+            link.
     """
     bags = [Path(row.bag) for row in store.rows(subject)]
     if not bags:
@@ -214,9 +216,14 @@ def delete(store: AttemptStore, folder: Path, subject: str) -> list[str]:
     own = [bag for bag in bags if bag.parent == folder.resolve() and bag.is_dir()]
     if recorded_now := next(filter(_grows, own), None):
         raise SessionError(f'{recorded_now} is being recorded: end that session first')
-    store.delete_subject(subject)
+    if link := next(filter(Path.is_symlink, own), None):
+        raise SessionError(
+            f'{link} is a link to {link.readlink()}: nothing is deleted; delete the bag there, and '
+            'the link, first'
+        )
     for bag in own:
         shutil.rmtree(bag)
+    store.delete_subject(subject)
     return [str(bag) for bag in own]
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from cutting_trainer.bags.playback_messages import first_time
+from cutting_trainer.bags.playback_messages import first_time, require_moment
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.recorded_tissue import first_current_keyframe, follow
 from cutting_trainer.bags.topic_names import CONTACT, MESH, SERVO_CF, UPDATES, of_session
@@ -65,13 +65,15 @@ def make_picture(bag: Path, file: Path, at: float | None) -> None:
         at: time of the tissue [s]; None: the end.
 
     Raises:
-        BagError: it is not a bag.
+        BagError: it is not a bag, or shorter.
         SessionError: there is no tissue in it, or the file cannot be written.
     """
     if file.suffix not in FORMATS:
         raise SessionError(f'{file} is no picture: give it an extension of {", ".join(FORMATS)}')
     if file.parent != bag and not file.parent.is_dir():
         raise SessionError(f'{file.parent} does not exist: make it first, the picture goes into it')
+    if at is not None:
+        require_moment(open_bag(bag), at)
     story = read_story(bag, at)
     with mpl.rc_context(STYLE):
         draw(story).savefig(file, dpi=130)

@@ -86,6 +86,8 @@ def replay(options: ReplayOptions) -> Status:
     Raises:
         BagError, SessionError, SceneError: an option or the bag is not valid.
     """
+    if options.as_recorded and options.output is not None:
+        raise SessionError('--output records a computed replay: leave --as-recorded or it out')
     bag = open_bag(options.bag)
     end = duration(bag)
     if not 0.0 <= options.start < end:

@@ -33,6 +33,7 @@ from cutting_trainer.recordings.what_if import recorded_run, run_experiment
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.session.scene_overrides import load_changed
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.simulation.serialisation import StateError
 from cutting_trainer.tissue_sim.simulation.state import from_state, shape_of
@@ -57,7 +58,7 @@ def resimulate(folder: Path, changes: Mapping[str, str], *, as_json: bool = Fals
         scene = load_scene(str(restore_scene(bag, Path(temporary))))
         warm_up_cutting(scene.cutting)
         if changes:
-            changed = load_scene(str(restore_scene(bag, Path(temporary), changes)))
+            changed = load_changed(restore_scene(bag, Path(temporary), changes), changes)
             warm_up_cutting(changed.cutting)
             return _experiment(bag, scene, changed, changes, as_json=as_json)
         return _verify(bag, scene, as_json=as_json)

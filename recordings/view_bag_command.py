@@ -27,7 +27,8 @@ from cutting_trainer.recordings.what_if import (
 )
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.in_process import make_force_path
-from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene
+from cutting_trainer.session.scene_overrides import load_changed
 from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.viewer.access_control import TOKEN_VARIABLE, link, make_gate
 from cutting_trainer.viewer.bag_timeline import ComputedTissue
@@ -103,7 +104,7 @@ def _recording(
     bag: Bag, folder: Path, changes: Mapping[str, str] | None = None
 ) -> tuple[Recording, Scene]:
     """Return a recorded session, and its scene with changes, whose file goes into a folder."""
-    scene = load_scene(str(restore_scene(bag, folder, changes or {})))
+    scene = load_changed(restore_scene(bag, folder, changes), changes or {})
     return Recording(bag, scene.tool, scene.device, scene.exercise), scene
 
 

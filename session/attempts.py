@@ -1,12 +1,13 @@
 """Who makes an attempt, and which one it is, for the bag of a session."""
 
 import sqlite3
+from contextlib import suppress
 from pathlib import Path
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.exercises.attempt_store import AttemptStore, new_pseudonym
+from cutting_trainer.exercises.attempt_store import AttemptStore, attempt_number, new_pseudonym
 from cutting_trainer.session.errors import SessionError
 
 STORE_FILE = 'attempts.sqlite'
@@ -74,6 +75,6 @@ def next_attempt(folder: Path, subject: str, exercise: str) -> int:
         except BagError:
             continue  # `attempts` names it
         if data.get('subject') == subject and Path(data.get('scene_file', '')).stem == exercise:
-            number = data.get('attempt', '')
-            last = max(last, int(number) if number.isdecimal() else 0)
+            with suppress(ValueError):
+                last = max(last, attempt_number(data.get('attempt', '')))
     return last + 1

@@ -1,6 +1,7 @@
 """`trainer demo`: run a session, record its bag, print its table and its verdict."""
 
 import json
+import re
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from cutting_trainer.bags.errors import BagError
+from cutting_trainer.exercises.attempt_store import SUBJECT
 from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
 from cutting_trainer.node_common.share_folder import PACKAGES, is_checkout
 from cutting_trainer.session.acceptance_criteria import Expected, judge
@@ -79,6 +81,11 @@ def run_demo(options: DemoOptions) -> Status:
     Raises:
         SessionError, SceneError, SettingsError: an option or the scene is not valid.
     """
+    if not re.fullmatch(SUBJECT, options.subject):
+        raise SessionError(
+            f'--subject is {options.subject!r:.60}: write a pseudonym of letters (A to Z), digits, '
+            'points, hyphens and underscores'
+        )
     scene = load_scene(options.scene)
     seconds = script_seconds(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)

@@ -16,6 +16,7 @@ MAX_DOMAIN = 101
 """Above this domain, DDS uses ports of Linux's ephemeral range."""
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
 _FIRST_PARTICIPANT = 10
+_RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _CREDENTIALS = struct.Struct('3i')
 
 
@@ -23,8 +24,14 @@ def parse_domain(text: str) -> int | Literal['free']:
     """Return the domain of the user's text, else of the environment, else 0.
 
     Raises:
-        SessionError: it is neither `free` nor a number from 0 to `MAX_DOMAIN`.
+        SessionError: it is neither `free` nor a number from 0 to `MAX_DOMAIN`, or the environment
+            keeps nodes from finding one another.
     """
+    if os.environ.get(_RANGE) == 'OFF':
+        raise SessionError(
+            f'{_RANGE} is OFF: the nodes of a session cannot find one another; unset it, or set it '
+            'to LOCALHOST'
+        )
     if text == 'free':
         return 'free'
     number = text or os.environ.get('ROS_DOMAIN_ID') or '0'

@@ -174,6 +174,8 @@ def _checks(
         if len(moves) == len(DIRECTIONS):
             checks += _scale_and_turn(node, moves, checks, extent(poses.positions), notes)
     if options.push:
+        if options.emulation is not None:
+            node.enable()
         metres = _metres(checks) if guide is None else guide.metres
         checks += _push(node, metres, notes)
     return [*checks, check_frame(node.frames, node.pose_topic)]

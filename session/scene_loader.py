@@ -22,6 +22,9 @@ from cutting_trainer.node_common.share_folder import SCENES
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
+_MIN_FRAMES = 1.2
+"""Frames of the tissue within `haptics.stale_after`."""
+
 
 class SessionSettings(SceneModel):
     """The section `session`."""
@@ -96,7 +99,7 @@ def load_scene(scene: str) -> Scene:
     """
     path = find_scene(scene)
     first = _load_tool(path, '')
-    return Scene(
+    loaded = Scene(
         name=path.stem,
         path=path,
         tissue=read_section(path, 'tissue', TissueSettings),
@@ -110,6 +113,15 @@ def load_scene(scene: str) -> Scene:
         exercise=read_section(path, 'exercise', ExerciseSettings),
         others=tuple(_load_tool(path, name) for name in tool_names(path)),
     )
+    rate = loaded.tissue.integration.rate
+    for tool in loaded.tools:
+        if tool.haptics.stale_after * rate < _MIN_FRAMES:
+            raise SettingsError(
+                f'{path}: haptics.stale_after: a force of {rate:g} frames a second '
+                f'(tissue.integration.rate) would fade after {tool.haptics.stale_after:g} s, '
+                f'between two frames; take at least {_MIN_FRAMES / rate:.3g} s, or more frames'
+            )
+    return loaded
 
 
 def _load_tool(path: Path, label: str) -> SceneTool:

@@ -1,16 +1,19 @@
 """A scene with some values replaced, as a file that nodes can read."""
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from io import StringIO
 from pathlib import Path
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from cutting_trainer.haptic_bridge.scene_schema import SettingsError
+from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.node_common.scene_reader import check_yaml
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.scene_loader import Scene
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 
@@ -40,6 +43,26 @@ def write_changed(scene: Scene, folder: Path, changes: Mapping[str, str], name: 
     return path
 
 
+def load_changed(path: Path, changes: Collection[str]) -> Scene:
+    """Read a scene that a command has changed.
+
+    Args:
+        path: file of the changed scene; nobody can look into it later.
+        changes: dotted keys that the user has given.
+
+    Raises:
+        SessionError: a value is not valid.
+        SceneError, SettingsError: the same, without changes.
+    """
+    if not changes:
+        return load_scene(str(path))
+    try:
+        return load_scene(str(path))
+    except (SceneError, SettingsError) as error:
+        said = re.sub(rf'^{re.escape(str(path))}(:\d+)?: ', '', str(error))
+        raise SessionError(f'--with {", ".join(changes)}: {said}') from None
+
+
 def parse_changes(arguments: list[str]) -> dict[str, str]:
     """Return dotted keys and values from the form `key=value`.
 
@@ -49,11 +72,13 @@ def parse_changes(arguments: list[str]) -> dict[str, str]:
     changes = {}
     for argument in arguments:
         key, equals, value = argument.partition('=')
-        if not equals or not key.strip() or not value.strip():
+        key, value = key.strip(), value.strip()
+        if not equals or not key or not value:
             raise SessionError(
                 f'--with {argument}: write key=value, as in tissue.material.toughness=40'
             )
-        changes[key.strip()] = value.strip()
+        # The changed scene lies in another folder.
+        changes[key] = json.dumps(str(Path(value).resolve())) if key == 'tissue.mesh' else value
     return changes
 
 

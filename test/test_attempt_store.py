@@ -21,6 +21,7 @@ from cutting_trainer.cli.main import main
 from cutting_trainer.exercises.attempt_store import (
     AttemptRow,
     AttemptStore,
+    attempt_number,
     learning_curves,
     new_pseudonym,
 )
@@ -96,6 +97,25 @@ def test_an_attempt_that_is_being_recorded_is_not_deleted(tmp_path) -> None:
     for each in bag.iterdir():
         os.utime(each, (1e9, 1e9))  # its recorder was killed long ago
     assert delete(store, tmp_path, 'subject-of-mine') == [str(bag)]
+
+
+def test_a_subject_with_a_linked_bag_is_deleted_in_whole_or_not_at_all(tmp_path) -> None:
+    folder, outside = tmp_path / 'bags', tmp_path / 'outside'
+    for each in (folder / 'mine', outside):
+        each.mkdir(parents=True)
+    (folder / 'linked').symlink_to(outside)
+    store = open_store(folder)
+    store.put([row(folder / 'mine', 'p'), row(folder / 'linked', 'p', number=2)])
+    with pytest.raises(SessionError, match=r'linked is a link to .*outside: nothing is deleted'):
+        delete(store, folder, 'p')
+    assert (folder / 'mine').exists() and len(store.rows('p')) == 2
+
+
+@pytest.mark.parametrize(('text', 'number'), [('', 0), ('x', 0), ('12', 12), ('1000000000', 10**9)])
+def test_a_bag_names_the_number_of_its_attempt_or_none(text, number) -> None:
+    assert attempt_number(text) == number
+    with pytest.raises(ValueError, match='above 1000000000'):
+        attempt_number('9' * 20)
 
 
 def test_a_curve_is_the_mean_of_the_last_five_and_knows_when_it_stays_above() -> None:

@@ -60,6 +60,8 @@ def test_a_bag_cut_off_is_whole_again_with_its_complete_chunks_for_every_reader(
     assert by_rosbags(folder) == [(m.topic, m.type, m.log_time, m.data) for m in kept]
     assert read_metadata(folder)['message_count'] == len(kept)
     assert result.cut_off > 0 and str(result.cut_off) in '\n'.join(account_lines(folder, result))
+    assert result.lost == 500 - len(kept)  # the metadata have the number of all
+    assert f'gone: {result.lost} messages' in bag.custom_data['repaired']
     assert sorted(path.name for path in folder.iterdir()) == ['metadata.yaml', 'session_0.mcap']
     assert repair_bag(folder).whole
 

@@ -18,8 +18,8 @@ class Clock:
     def create_publisher(self, *_: Any) -> SimpleNamespace:
         return SimpleNamespace(publish=lambda _: self.said.append(self.now))
 
-    def create_timer(self, *_: Any) -> None:
-        return None
+    def create_timer(self, *_: Any, clock: Any) -> None:
+        assert clock.clock_type == ros.ClockType.STEADY_TIME  # that of a simulation may stand still
 
     def get_fully_qualified_name(self) -> str:
         return '/a'

@@ -90,7 +90,7 @@ HERE = (
     'resimulate BAG --with tissue.material.toughness=40',
     'resimulate bags/samples/format_7/crossing_cuts --with tissue.integration.frequency_growth=2',
     'export BAG tables',
-    'export BAG mesh.vtu --at 12',
+    'export BAG mesh.vtu --at 1',
     'repair BAG',
     'plan block',
     'doctor',

@@ -262,12 +262,12 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
         str(surface),
         '--json',
     ]
-    command += ['--edge', '0.009', '-o', str(folder / 'mine')]
+    command += ['--edge', '0.009', '-o', str(folder / 'mine #2')]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == Status.OK, done.stderr
     assert {path.suffix for path in folder.iterdir()} == {'.stl', '.msh', '.yaml'}
     assert len([*folder.iterdir()]) == 3  # nothing of the mesher's own
-    return folder / 'mine.yaml', json.loads(done.stdout)
+    return folder / 'mine #2.yaml', json.loads(done.stdout)
 
 
 def test_surface_that_crosses_itself_is_refused_with_the_place_and_nothing_is_written(

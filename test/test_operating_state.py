@@ -347,9 +347,9 @@ def test_two_scales_of_one_request_count_together(bridge: HapticBridge):
 
 def test_a_scale_out_of_range_is_refused_in_a_sentence(bridge: HapticBridge):
     for name, wrong, why in (
-        ('motion_scale', 0.0, 'motion_scale is 0: input should be greater than 0'),
+        ('motion_scale', 0.0, 'motion_scale is 0: input should be greater than or equal to 0.001'),
         ('motion_scale', 1e9, 'motion_scale is 1e+09: input should be less than or equal to 100'),
-        ('force_scale', -1.0, 'force_scale is -1: input should be greater than 0'),
+        ('force_scale', -1.0, 'force_scale is -1: input should be greater than or equal to 0.001'),
         ('force_scale', float('nan'), 'force_scale is nan: input should be a finite number'),
     ):
         refused = bridge.set_parameters([Parameter(name, value=wrong)])[0]

@@ -27,11 +27,11 @@ from cutting_trainer.haptic_bridge.devices.probe_node import DeviceProbe
 from cutting_trainer.haptic_bridge.devices.probe_stream import Poses, ProbeCheck
 from cutting_trainer.haptic_bridge.scene_schema import SettingsError, Transform
 from cutting_trainer.node_common.orientation import from_rpy
-from cutting_trainer.node_common.share_folder import SCENES
+from cutting_trainer.node_common.share_folder import SCENES, scene_names
 from cutting_trainer.session import probe_command as command
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.exit_status import Status
-from cutting_trainer.session.place_device import Guide, write_placement
+from cutting_trainer.session.place_device import SHIPPED, Guide, write_placement
 from cutting_trainer.session.probe_command import Emulation, ProbeOptions, run_probe
 from cutting_trainer.session.scene_loader import load_scene
 
@@ -170,6 +170,10 @@ def test_a_scene_of_the_trainer_and_points_in_line_are_bad_input(capsys, tmp_pat
             cli.main(['probe-device', '--domain', 'free', *words])
         assert stopped.value.code == Status.BAD_INPUT
         assert reason in ' '.join(capsys.readouterr().err.split())
+
+
+def test_the_scenes_of_the_trainer_are_known_and_a_copy_beside_them_is_none():
+    assert sorted(SHIPPED) == scene_names()
 
 
 def test_a_late_stream_does_not_stop_the_writing_and_a_wrong_unit_does(tmp_path):

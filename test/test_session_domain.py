@@ -52,6 +52,14 @@ def test_domain_is_taken_from_the_option_then_the_environment_then_zero(
     assert parse_domain('') == 0
 
 
+def test_nodes_that_may_not_find_one_another_make_no_session(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF')
+    with pytest.raises(SessionError, match='ROS_AUTOMATIC_DISCOVERY_RANGE is OFF'):
+        parse_domain('free')
+
+
 @pytest.mark.parametrize('text', ['102', '-1', 'lab', '1.5'])
 def test_domain_that_cannot_be_is_refused(text: str) -> None:
     with pytest.raises(SessionError, match='from 0 to 101'):

@@ -343,7 +343,7 @@ def test_two_trainers_side_by_side_tell_their_nodes_apart_by_namespace() -> None
         node: Any = SimpleNamespace(
             get_fully_qualified_name=lambda n=namespace: f'/{n}/bridge'.replace('//', '/'),
             create_publisher=lambda *_: SimpleNamespace(publish=published.append),
-            create_timer=lambda *_: None,
+            create_timer=lambda *_, **__: None,
             get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time)),
         )
         Diagnostics(node, lambda: (b'\0', '', {})).publish()

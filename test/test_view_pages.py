@@ -119,7 +119,7 @@ def test_another_tissue_is_shown_though_its_revision_is_that_of_the_one_before()
     """Both untouched, as where an exercise begins at once."""
     replica, source, shapes = MeshReplica(), TissueSource('tissue'), []
     for cells in ((2, 2, 2), (3, 2, 2)):
-        mesh = TetMesh(*box(cells, 0.01), np.zeros(0, np.int64))
+        mesh = TetMesh(*box(cells, 0.01))
         replica.load(mesh_message(mesh, np.zeros_like(mesh.rest), '', 0, 0, 1))
         frame = source.frame(replica)
         assert frame is not None

@@ -241,9 +241,9 @@ class Integration(SceneModel):
     rate: float = Field(default=30.0, ge=1, le=240, description='frames a second [Hz], 1 to 240')
     safety: float = Field(
         default=0.8,
-        gt=0,
+        ge=0.01,
         le=1,
-        description='share of the stable step that is used [-], above 0 to 1',
+        description='share of the stable step that is used [-], 0.01 to 1',
     )
     frequency_growth: float = Field(
         default=3.0,
@@ -261,6 +261,15 @@ class Integration(SceneModel):
     max_substeps: int = Field(
         default=200, ge=1, le=10000, description='substeps of a frame at most [-], 1 to 10000'
     )
+
+    @model_validator(mode='after')
+    def _check_order(self) -> 'Integration':
+        if self.min_substeps > self.max_substeps:
+            raise ValueError(
+                f'min_substeps {self.min_substeps} is above max_substeps {self.max_substeps}: '
+                'exchange them, or raise max_substeps'
+            )
+        return self
 
 
 class ActiveRegionSettings(SceneModel):

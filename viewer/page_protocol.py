@@ -39,6 +39,8 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from cutting_trainer.exercises.attempt_store import SUBJECT
+
 VERSION = 1
 MAX_MESSAGE = 2048
 """[bytes] of a message from a page."""
@@ -115,7 +117,7 @@ class Attempt(PageMessage):
 
     op: Literal['attempt']
     scene: Name
-    subject: Annotated[str, Field(max_length=MAX_NAME, pattern=r'^[A-Za-z0-9_.-]*$')]
+    subject: Annotated[str, Field(max_length=MAX_NAME, pattern=SUBJECT)]
 
 
 class Hold(PageMessage):

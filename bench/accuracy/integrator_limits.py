@@ -72,7 +72,7 @@ def run_stability(scene: str, *, as_json: bool = False) -> None:
         'used: from the bound of the frequency that the simulation has; theory: from the highest '
         f'frequency itself; measured: a disturbance grows within {_STEPS} steps. The implicit '
         'integrator has no limit; its step is a matter of accuracy. substeps: of a frame, by the '
-        f'is used and a safety of {task.stepping.safety:g}.'
+        f'step that is used and a safety of {task.stepping.safety:g}.'
     )
 
 

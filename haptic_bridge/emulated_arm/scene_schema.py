@@ -5,19 +5,18 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from cutting_trainer.haptic_bridge.scene_schema import SettingsError
+from cutting_trainer.haptic_bridge.scene_schema import Angles, Place, SettingsError
 from cutting_trainer.node_common.orientation import from_quaternion, from_rpy
 from cutting_trainer.node_common.scene_reader import SceneModel
 
-Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
 class PoseSettings(SceneModel):
     """A pose of the tool in the tissue frame."""
 
-    position: Vector = Field(description='[m]')
-    rpy_deg: Vector | None = Field(
+    position: Place = Field(description='[m]')
+    rpy_deg: Angles | None = Field(
         None, description='[deg] roll, pitch, yaw about the fixed axes x, y, z'
     )
     quaternion: Quaternion | None = Field(None, description='x, y, z, w instead of rpy_deg')

@@ -35,6 +35,9 @@ class Material:
         regions: constants of regions 1, 2, ... of the mesh; region 0 has those above. Poisson's
             ratio, stiffening and prony are common: all stresses of a region are then in proportion
             to its E.
+
+    Raises:
+        ValueError: a constant is not that of a tissue.
     """
 
     youngs_modulus: float
@@ -45,6 +48,16 @@ class Material:
     stiffening: float = 0.0
     prony: tuple[tuple[float, float], ...] = ()
     regions: tuple[RegionMaterial, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, value in (('youngs_modulus', self.youngs_modulus), ('density', self.density)):
+            if not 0.0 < value < math.inf:
+                raise ValueError(f'{name} is {value}: it must be above 0')
+        if not -1.0 < self.poissons_ratio < 0.5:
+            raise ValueError(f'poissons_ratio is {self.poissons_ratio}: it must be below 0.5')
+        for name in ('alpha', 'beta', 'stiffening'):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f'{name} is {getattr(self, name)}: it must be 0 or above')
 
     @property
     def relative_stiffness(self) -> np.ndarray:

@@ -333,6 +333,7 @@ class ElasticModel:
 
     Raises:
         MeshError: the mesh has a region without constants.
+        ValueError: there is no such model.
     """
 
     def __init__(
@@ -342,6 +343,8 @@ class ElasticModel:
         name: ModelName = 'linear',
         tolerance: float = STRAIN_TOLERANCE,
     ) -> None:
+        if name not in MODELS:
+            raise ValueError(f'there is no model {name!r}: give one of {", ".join(MODELS)}')
         self.mesh = mesh
         self.material = material
         self.name = name

@@ -77,6 +77,24 @@ class Touched:
     renumbered: list[tuple[int, int]]
 
 
+def _require_valid(rest: np.ndarray, tetrahedra: np.ndarray, fixed: np.ndarray | None) -> None:
+    """Reject arrays that are none of a mesh: kernels index them unchecked."""
+    count = len(rest)
+    if rest.shape != (count, 3) or not np.isfinite(rest).all():
+        raise MeshError(f'rest positions have the shape {rest.shape}: finite (n, 3) are needed')
+    if tetrahedra.shape != (len(tetrahedra), 4):
+        raise MeshError(f'tetrahedra have the shape {tetrahedra.shape}: (m, 4) is needed')
+    absent = ((tetrahedra < 0) | (tetrahedra >= count)).any(axis=1)
+    if absent.any():
+        which = int(np.argmax(absent))
+        nodes = tetrahedra[which].tolist()
+        raise MeshError(f'tetrahedron {which} has nodes {nodes}: the mesh has {count}, from 0 on')
+    if fixed is not None and np.shape(fixed) != (count,):
+        raise MeshError(
+            f'fixed has the shape {np.shape(fixed)}: a mask of all nodes, ({count},), is needed'
+        )
+
+
 class TetMesh:
     """Rest shape and connectivity of the tissue, in arrays that grow by doubling.
 
@@ -90,7 +108,8 @@ class TetMesh:
         regions: row of the table of materials by tetrahedron, shape (m,); (0,): one material.
 
     Raises:
-        MeshError: a face belongs to more than two tetrahedra.
+        MeshError: an array has another shape, a position is not finite, a tetrahedron has a node
+            that is not there, or a face belongs to more than two tetrahedra.
     """
 
     def __init__(
@@ -100,6 +119,7 @@ class TetMesh:
         fixed: np.ndarray | None = None,
         regions: np.ndarray | None = None,
     ) -> None:
+        _require_valid(np.asarray(rest), np.asarray(tetrahedra), fixed)
         self.node_count = len(rest)
         # Spare room: the first cut of a large mesh does not have to move it all.
         m, n = len(tetrahedra), len(rest) + len(rest) // 4

@@ -82,6 +82,8 @@ def dearer(candidate: Candidate, best: Candidate) -> Rejection:
     """Return the rejection of a method that meets the budget but is not clearly cheaper."""
     other = best.name.removeprefix(f'{best.model} by ')
     why = f'{ms(candidate.cost.frame)} a frame, where {other} takes {ms(best.cost.frame)}'
+    if candidate.cost.frame < best.cost.frame:
+        why += ': no clear gain, and less merit'
     return Rejection(candidate.name, why, fails=False)
 
 
