@@ -165,6 +165,7 @@ def require_moment(bag: Bag, seconds: float) -> None:
         BagError: it is before the bag or after it.
     """
     end = duration(bag)
-    if not 0.0 <= seconds <= end:
-        said = f'{bag.path.parent} lasts from 0 to {end:.3f} s'
+    if not 0.0 <= seconds <= round(end, 3):
+        folder = bag.path if bag.path.is_dir() else bag.path.parent
+        said = f'{folder} lasts from 0 to {end:.3f} s'
         raise BagError(f'{said}: there is no tissue at {seconds:g} s')

@@ -115,10 +115,10 @@ def repair_bag(folder: Path) -> Repair:
             data = _custom_data(folder, salvage)
             writer = BagWriter(temporary / folder.resolve().name, custom_data=data)
             result, refused = _write(salvage, writer)
+            stated = salvage.summary is not None and salvage.summary.messages is not None
+            if not stated and result.lost == 0 and not result.repeated:
+                result.lost = max(_promised(folder) - writer.tally.messages, 0)
         result.flaw = wrong
-        missing = _promised(folder) - writer.tally.messages
-        if missing > 0:
-            result.lost = max(result.lost or 0, missing)
         start = writer.tally.start
         result.lost_spans = [((a - start) * 1e-9, (b - start) * 1e-9) for a, b in result.lost_spans]
         data[_REPAIRED] = _noted(data.get(_REPAIRED, ''), result)

@@ -64,7 +64,7 @@ def pull_blade(
     time; from there, the way of the tool is followed again.
     """
     c, s = setup[0], state[0]
-    length = _length_in_tissue(setup, history)
+    length = c.length * extrapolation.share_inside(history[0].immersed)
     steps = _STEPS if s.renewed else 1
     s.renewed = False
     for step in range(1, steps + 1):
@@ -72,7 +72,7 @@ def pull_blade(
         if _go_on(setup, state, history, length, out):
             _force_after(setup, state, history, step / steps, out, torque)
     if history[0].leaving > 0.0:
-        s.out = _share_slipped_out(setup, state, history)
+        _slip_out(setup, state, history, length)
     left = min(1.0 - s.out, 1.0)
     for k in range(3):
         # The coupling is as stiff as its scene says where half of the blade is in the tissue.
@@ -96,16 +96,6 @@ def _force_after(
     for k in range(3):
         at[k] = h.position[1, k] + share * (s.tip[k] - h.position[1, k]) - s.advanced[k]
     extrapolation.local_blade(at, s.arms, history, setup[0].max_stiffness, out, torque)
-
-
-@inner
-def _length_in_tissue(setup: np.ndarray, history: np.ndarray) -> float:
-    """Return the length of the blade in the tissue at the newest sample [m].
-
-    Places along it from s to s + b have the variance b^2 / 12.
-    """
-    h = history[0]
-    return setup[0].length * np.sqrt(12.0 * max(h.immersed[1] - h.immersed[0] ** 2, 0.0))
 
 
 @inner
@@ -146,9 +136,9 @@ def _go_on(
         cosine = max(_cosine(force, s.arms[1] - s.arms[0]), 0.0)
         held = max(1.0 - soft * limit * cosine / length, _MIN_HELD)
         along = max(along, min(along / held, _way_out(setup, state, history)))
-    before = 2.0 * h.immersed[0] * c.length  # its tip is in the tissue
-    left = along / before if before > 0.0 else 0.0
-    s.out = min(max(left, 1.0 - _MAX_DEEPER), 1.0)
+    left = max(along - _protruding(setup, history, length), min(along, 0.0)) / length
+    # Until the next sample, no part comes back that has left: the force would jump.
+    s.out = min(max(left, s.out if s.out > 0.0 else 1.0 - _MAX_DEEPER), 1.0)
     return True
 
 
@@ -163,18 +153,27 @@ def _way_out(setup: np.ndarray, state: np.ndarray, history: np.ndarray) -> float
 
 
 @inner
-def _share_slipped_out(setup: np.ndarray, state: np.ndarray, history: np.ndarray) -> float:
-    """Return the share of the length in the tissue that a blade that slips out has left behind.
+def _protruding(setup: np.ndarray, history: np.ndarray, length: float) -> float:
+    """Return by how much the blade's tip is out beyond the tissue, as below a sheet [m].
 
-    By way of the tool, `leaving` leaves at the sample, and then in inverse proportion to the rest:
-    the shorter the edge, the farther its load moves the tissue, which springs back.
+    As the blade is drawn out, this part goes first, and takes nothing from the length in the
+    tissue.
     """
-    h = history[0]
-    before = 2.0 * h.immersed[0] * setup[0].length  # its tip is in the tissue
-    if before <= 0.0:
-        return 1.0
-    left = h.leaving * _way_out(setup, state, history) / before
-    return 1.0 - np.sqrt(max(1.0 - 2.0 * left, 0.0))
+    return max(history[0].immersed[0] * setup[0].length - length / 2, 0.0)
+
+
+@inner
+def _slip_out(setup: np.ndarray, state: np.ndarray, history: np.ndarray, length: float) -> None:
+    """Let a blade that slips out leave by the way of the tool.
+
+    By way, `leaving` leaves at the sample, and then in inverse proportion to the rest: the shorter
+    the edge, the farther its load moves the tissue, which springs back.
+    """
+    way = _way_out(setup, state, history) - _protruding(setup, history, length)
+    if way <= 0.0 or length == 0.0:
+        return
+    rest = np.sqrt(max(1.0 - 2.0 * history[0].leaving * way / length, 0.0))
+    state[0].out = max(state[0].out, 1.0 - rest)
 
 
 @inner

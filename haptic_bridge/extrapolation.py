@@ -343,10 +343,21 @@ def push(
 
 
 @inner
+def share_inside(immersed: np.ndarray) -> float:
+    """Return the share of the blade that is in the tissue.
+
+    Args:
+        immersed: mean and mean square of the places in the tissue, shape (2,). Places from s to s +
+            b have the variance b^2 / 12.
+    """
+    return np.sqrt(12.0 * max(immersed[1] - immersed[0] ** 2, 0.0))
+
+
+@inner
 def _leaving(history: np.ndarray, arms: np.ndarray, immersed: np.ndarray) -> float:
     """Return the length of the blade that has left the tissue by its way out since the last sample.
 
-    0 where it is not drawn out, or takes the tissue along; else 1 to 2: tissue that is let go
+    0 where it is not drawn out, or takes the tissue along; else 0.3 to 2: tissue that is let go
     springs back.
 
     Args:
@@ -361,9 +372,8 @@ def _leaving(history: np.ndarray, arms: np.ndarray, immersed: np.ndarray) -> flo
         way += axis[k] * (h.position[1, k] - h.position[0, k])
     if way <= _MIN_WAY_M * length:
         return 0.0
-    # Twice the mean: the tip of the blade is in the tissue.
-    left = 2.0 * length * (h.immersed[0] - immersed[0]) / (way / length)
-    return min(max(left, 1.0), _MAX_LEAVING) if left > _MIN_LEAVING else 0.0
+    left = length * (share_inside(h.immersed) - share_inside(immersed)) / (way / length)
+    return min(left, _MAX_LEAVING) if left > _MIN_LEAVING else 0.0
 
 
 @inner

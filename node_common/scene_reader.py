@@ -321,7 +321,7 @@ def _check_tools(node: Node, path: Path) -> None:
         if not _TOOL_NAME.fullmatch(name):
             raise SceneError(
                 f'{where} has {shortened(name)}: a tool is named by a ROS namespace, '
-                'such as grasper: lower-case letters, digits and underscores'
+                'such as grasper: lower-case letters, digits and single underscores'
             )
         if name in _TAKEN:
             raise SceneError(f'{where}.{name}: a topic or node has this name: choose another')

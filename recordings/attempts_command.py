@@ -73,7 +73,7 @@ def attempt_of(folder: Path, store: AttemptStore) -> AttemptRow | None:
     if scene is None or not scene.exercise.title:
         return None
     data = bag.custom_data
-    subject = ''.join(filter(str.isprintable, data.get('subject', 'unknown')))
+    subject = ''.join(c if c.isprintable() else '?' for c in data.get('subject', 'unknown'))
     exercise = scene.name
     attempt = attempt_number(data.get('attempt', ''))
     row = AttemptRow(

@@ -7,7 +7,12 @@ from pathlib import Path
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.bags.reader import open_bag
-from cutting_trainer.exercises.attempt_store import AttemptStore, attempt_number, new_pseudonym
+from cutting_trainer.exercises.attempt_store import (
+    MAX_ATTEMPT,
+    AttemptStore,
+    attempt_number,
+    new_pseudonym,
+)
 from cutting_trainer.session.errors import SessionError
 
 STORE_FILE = 'attempts.sqlite'
@@ -77,4 +82,4 @@ def next_attempt(folder: Path, subject: str, exercise: str) -> int:
         if data.get('subject') == subject and Path(data.get('scene_file', '')).stem == exercise:
             with suppress(ValueError):
                 last = max(last, attempt_number(data.get('attempt', '')))
-    return last + 1
+    return min(last + 1, MAX_ATTEMPT)

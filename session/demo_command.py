@@ -36,7 +36,7 @@ from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.progress import SessionProgress
 from cutting_trainer.session.result_table import session_tables
-from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene, require_frames
 from cutting_trainer.session.summary import Summary, summarise
 from cutting_trainer.session.supervisor import Supervisor
 from cutting_trainer.session.terminal import session_console
@@ -87,6 +87,7 @@ def run_demo(options: DemoOptions) -> Status:
             'points, hyphens and underscores'
         )
     scene = load_scene(options.scene)
+    require_frames(scene)
     seconds = script_seconds(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)
     tools = [tool.label for tool in scene.others]

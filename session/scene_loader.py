@@ -99,7 +99,7 @@ def load_scene(scene: str) -> Scene:
     """
     path = find_scene(scene)
     first = _load_tool(path, '')
-    loaded = Scene(
+    return Scene(
         name=path.stem,
         path=path,
         tissue=read_section(path, 'tissue', TissueSettings),
@@ -113,15 +113,24 @@ def load_scene(scene: str) -> Scene:
         exercise=read_section(path, 'exercise', ExerciseSettings),
         others=tuple(_load_tool(path, name) for name in tool_names(path)),
     )
-    rate = loaded.tissue.integration.rate
-    for tool in loaded.tools:
-        if tool.haptics.stale_after * rate < _MIN_FRAMES:
+
+
+def require_frames(scene: Scene) -> None:
+    """Reject a scene whose force would fade between two frames.
+
+    Raises:
+        SettingsError: the tissue has too few frames a second for `haptics.stale_after`.
+    """
+    rate = scene.tissue.integration.rate
+    for tool in scene.tools:
+        stale = tool.haptics.stale_after
+        if stale * rate < _MIN_FRAMES:
+            where = f'tools.{tool.label}.haptics' if tool.label else 'haptics'
             raise SettingsError(
-                f'{path}: haptics.stale_after: a force of {rate:g} frames a second '
-                f'(tissue.integration.rate) would fade after {tool.haptics.stale_after:g} s, '
-                f'between two frames; take at least {_MIN_FRAMES / rate:.3g} s, or more frames'
+                f'{scene.path}: {where}.stale_after: a force of {rate:g} frames a second would '
+                f'fade after {stale:g} s, between two frames; set tissue.integration.rate to '
+                f'{_MIN_FRAMES / stale:.3g} at least'
             )
-    return loaded
 
 
 def _load_tool(path: Path, label: str) -> SceneTool:

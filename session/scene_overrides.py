@@ -77,9 +77,19 @@ def parse_changes(arguments: list[str]) -> dict[str, str]:
             raise SessionError(
                 f'--with {argument}: write key=value, as in tissue.material.toughness=40'
             )
-        # The changed scene lies in another folder.
-        changes[key] = json.dumps(str(Path(value).resolve())) if key == 'tissue.mesh' else value
+        changes[key] = _absolute(value) if key == 'tissue.mesh' else value
     return changes
+
+
+def _absolute(mesh: str) -> str:
+    """Return a path in YAML for a scene in another folder; one that is no text stays."""
+    try:
+        path = YAML(typ='safe', pure=True).load(mesh)
+    except (YAMLError, ValueError):
+        return mesh
+    return (
+        json.dumps(str(Path(path).resolve()), ensure_ascii=False) if isinstance(path, str) else mesh
+    )
 
 
 def change(scene: dict[str, object], key: str, value: str) -> None:

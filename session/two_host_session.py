@@ -18,7 +18,7 @@ from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.network import Network, network_environment
 from cutting_trainer.session.node_commands import bridge_side_nodes, sim_side_nodes
 from cutting_trainer.session.progress import SessionProgress
-from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.scene_loader import load_scene, require_frames
 from cutting_trainer.session.supervisor import Supervisor
 from cutting_trainer.session.terminal import session_console
 
@@ -57,6 +57,7 @@ def run_bridge_side(options: BridgeSide) -> Status:
         SessionError, SceneError, SettingsError: an option or the scene is not valid.
     """
     scene = load_scene(options.scene)
+    require_frames(scene)
     seconds = script_seconds(scene, options.seconds) if options.arm else _FOREVER
     bag = new_bag(options.bag, scene.name)
     nodes = bridge_side_nodes(scene.path, bag, options.seed, seconds, arm=options.arm)

@@ -34,7 +34,7 @@ from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.outcome import Outcome
 from cutting_trainer.session.probe_command import ProbeOptions, probe
 from cutting_trainer.session.progress import SessionProgress
-from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.session.scene_loader import Scene, load_scene, require_frames
 from cutting_trainer.session.scene_overrides import tissue_changes, write_changed
 from cutting_trainer.session.supervisor import Event, Supervisor
 from cutting_trainer.session.terminal import session_console
@@ -81,6 +81,7 @@ def run_view(options: ViewOptions) -> Status:
         PageError, SessionError, SceneError, SettingsError: an option or the scene is not valid.
     """
     scene = load_scene(options.scene)
+    require_frames(scene)
     notes = session_console()
     if options.arm:
         require_device(options, scene, notes)

@@ -124,7 +124,7 @@ SCENES = [
           'coupling_stiffness', '9000', 'max_stiffness'),
     scene('fade too fast', 'haptics.fade', 1e-4, 'haptics.fade', '0.0001', '0.005'),
     scene('frames too rare for the force', 'tissue.integration', {'rate': 5},
-          'haptics.stale_after', '5 frames', 'take at least 0.24 s'),
+          'haptics.stale_after', '5 frames', 'rate to 12 at least'),
     scene('fewest substeps above the most', 'tissue.integration', {'min_substeps': 300},
           'min_substeps 300', 'max_substeps 200', 'exchange'),
     scene('device two kilometres away', 'device.tissue_from_device.translation', [0, 0, 2000],

@@ -101,6 +101,22 @@ def test_a_blade_that_slips_out_leaves_the_faster_the_less_of_it_is_in_the_tissu
     assert falls[-1] > 3.0 * falls[0]
 
 
+def test_a_blade_through_a_sheet_holds_until_its_tip_has_come_to_it() -> None:
+    rig, below = loaded(LOAD), 6e-3
+    still = rig.spoil
+
+    def told(sample: StampedMessage) -> StampedMessage:
+        """The part in the tissue is as long as before, and nearer to the tip by the way out."""
+        mean = (below - (sample.values[9] - DEEP) + IMMERSED / 2) / LENGTH
+        return spoiled(still(sample), immersed=(mean, mean**2 + (IMMERSED / LENGTH) ** 2 / 12))
+
+    rig.spoil, rig.sim = told, True
+    drawn(rig, np.linspace(0.0, 2e-3, 2 * FRAME + 1))
+    rig.sim = False
+    sizes = np.linalg.norm(drawn(rig, 2e-3 + np.linspace(0.0, 2e-3, 41)), axis=1)
+    assert (sizes >= 0.99 * LOAD).all()
+
+
 def test_tissue_that_two_samples_show_to_be_stiffer_is_felt_so_from_then_on() -> None:
     rig = loaded(LOAD)
     still, shown = rig.spoil, 1.5 * STIFFNESS

@@ -43,6 +43,7 @@ NODES, TETRAHEDRA = np.vstack((np.zeros(3), np.eye(3))), np.array([[0, 1, 2, 3]]
         (NODES[:, :2], TETRAHEDRA, None, 'rest positions have the shape (4, 2)'),
         (NODES * np.nan, TETRAHEDRA, None, 'finite'),
         (NODES, TETRAHEDRA[:, :3], None, 'tetrahedra have the shape (1, 3)'),
+        (NODES, TETRAHEDRA * np.nan, None, 'the type float64: integers'),
         (NODES, TETRAHEDRA + 1, None, 'tetrahedron 0 has nodes [1, 2, 3, 4]: the mesh has 4'),
         (NODES, TETRAHEDRA - 1, None, 'tetrahedron 0 has nodes [-1, 0, 1, 2]'),
         (NODES, TETRAHEDRA, np.array([0, 1]), 'fixed has the shape (2,)'),

@@ -125,7 +125,7 @@ def _value(field: FieldInfo, meaning: str) -> str:
         return ', '.join(f'`{choice}`' for choice in choices)
     if get_origin(kind) is tuple:
         item = get_args(kind)[0]
-        if item is str:
+        if str in (item, getattr(item, '__origin__', None)):
             return 'words'
         if get_origin(item) is tuple:
             return 'points'

@@ -37,7 +37,7 @@ class Material:
             to its E.
 
     Raises:
-        ValueError: a constant is not that of a tissue.
+        ValueError: a constant of the tissue's own is not that of a tissue.
     """
 
     youngs_modulus: float
@@ -52,12 +52,16 @@ class Material:
     def __post_init__(self) -> None:
         for name, value in (('youngs_modulus', self.youngs_modulus), ('density', self.density)):
             if not 0.0 < value < math.inf:
-                raise ValueError(f'{name} is {value}: it must be above 0')
+                raise ValueError(f'{name} is {value}: it must be above 0, and finite')
         if not -1.0 < self.poissons_ratio < 0.5:
-            raise ValueError(f'poissons_ratio is {self.poissons_ratio}: it must be below 0.5')
+            raise ValueError(
+                f'poissons_ratio is {self.poissons_ratio}: it must be between -1 and 0.5'
+            )
         for name in ('alpha', 'beta', 'stiffening'):
             if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f'{name} is {getattr(self, name)}: it must be 0 or above')
+                raise ValueError(
+                    f'{name} is {getattr(self, name)}: it must be 0 or above, and finite'
+                )
 
     @property
     def relative_stiffness(self) -> np.ndarray:

@@ -77,18 +77,31 @@ class Touched:
     renumbered: list[tuple[int, int]]
 
 
-def _require_valid(rest: np.ndarray, tetrahedra: np.ndarray, fixed: np.ndarray | None) -> None:
+def _require_valid(
+    rest: np.ndarray,
+    tetrahedra: np.ndarray,
+    fixed: np.ndarray | None,
+    regions: np.ndarray | None,
+) -> None:
     """Reject arrays that are none of a mesh: kernels index them unchecked."""
     count = len(rest)
     if rest.shape != (count, 3) or not np.isfinite(rest).all():
         raise MeshError(f'rest positions have the shape {rest.shape}: finite (n, 3) are needed')
-    if tetrahedra.shape != (len(tetrahedra), 4):
-        raise MeshError(f'tetrahedra have the shape {tetrahedra.shape}: (m, 4) is needed')
+    if tetrahedra.shape != (len(tetrahedra), 4) or tetrahedra.dtype.kind not in 'iu':
+        raise MeshError(
+            f'tetrahedra have the shape {tetrahedra.shape} and the type {tetrahedra.dtype}: '
+            'integers, (m, 4), are needed'
+        )
     absent = ((tetrahedra < 0) | (tetrahedra >= count)).any(axis=1)
     if absent.any():
         which = int(np.argmax(absent))
         nodes = tetrahedra[which].tolist()
         raise MeshError(f'tetrahedron {which} has nodes {nodes}: the mesh has {count}, from 0 on')
+    if regions is not None and np.shape(regions) not in ((0,), (len(tetrahedra),)):
+        raise MeshError(
+            f'regions have the shape {np.shape(regions)}: one for each of {len(tetrahedra)} '
+            'tetrahedra is needed'
+        )
     if fixed is not None and np.shape(fixed) != (count,):
         raise MeshError(
             f'fixed has the shape {np.shape(fixed)}: a mask of all nodes, ({count},), is needed'
@@ -119,7 +132,7 @@ class TetMesh:
         fixed: np.ndarray | None = None,
         regions: np.ndarray | None = None,
     ) -> None:
-        _require_valid(np.asarray(rest), np.asarray(tetrahedra), fixed)
+        _require_valid(np.asarray(rest), np.asarray(tetrahedra), fixed, regions)
         self.node_count = len(rest)
         # Spare room: the first cut of a large mesh does not have to move it all.
         m, n = len(tetrahedra), len(rest) + len(rest) // 4
