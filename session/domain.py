@@ -16,7 +16,8 @@ MAX_DOMAIN = 101
 """Above this domain, DDS uses ports of Linux's ephemeral range."""
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
 _FIRST_PARTICIPANT = 10
-_RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+"""Variable that says how far nodes may find one another."""
 _CREDENTIALS = struct.Struct('3i')
 
 
@@ -27,9 +28,9 @@ def parse_domain(text: str) -> int | Literal['free']:
         SessionError: it is neither `free` nor a number from 0 to `MAX_DOMAIN`, or the environment
             keeps nodes from finding one another.
     """
-    if os.environ.get(_RANGE) == 'OFF':
+    if os.environ.get(RANGE) == 'OFF':
         raise SessionError(
-            f'{_RANGE} is OFF: the nodes of a session cannot find one another; unset it, or set it '
+            f'{RANGE} is OFF: the nodes of a session cannot find one another; unset it, or set it '
             'to LOCALHOST'
         )
     if text == 'free':

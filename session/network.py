@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from cutting_trainer.session.domain import RANGE
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.session.node_commands import PROFILES, RANGE, discovery, node_environment
+from cutting_trainer.session.node_commands import PROFILES, discovery, node_environment
 
 PEERS, SERVER = 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'
 EVERYTHING = 'ROS_SUPER_CLIENT'

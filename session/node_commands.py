@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cutting_trainer.node_common.share_folder import PACKAGES, share_folder
+from cutting_trainer.session.domain import RANGE
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.processors import Work
 
@@ -59,7 +60,7 @@ E_STOP_PARAMETERS: dict[str, dict[str, object]] = {BRIDGE_NODE: {'e_stop_pressed
 RECORDER_GRACE_S = 20.0  # [s]
 LOCAL, PORT = '127.0.0.1', 8080
 """Default address and port of the page."""
-RANGE, PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
+PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 def session_nodes(

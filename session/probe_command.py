@@ -162,20 +162,16 @@ def _checks(
     checks += check_stream(scaled, profile, node.pose_topic)
     if guide is not None and hindrances(checks):
         return checks
+    if options.emulation is not None and (guide is not None or options.moves or options.push):
+        node.enable()
     if guide is not None:
-        if options.emulation is not None:
-            node.enable()
         checks += guide.lead(node, notes)
     elif options.moves:
-        if options.emulation is not None:
-            node.enable()
         moves = _moves(node, extent(poses.positions), notes)
         checks += check_moves(moves, node.pose_topic)
         if len(moves) == len(DIRECTIONS):
             checks += _scale_and_turn(node, moves, checks, extent(poses.positions), notes)
     if options.push:
-        if options.emulation is not None:
-            node.enable()
         metres = _metres(checks) if guide is None else guide.metres
         checks += _push(node, metres, notes)
     return [*checks, check_frame(node.frames, node.pose_topic)]

@@ -54,11 +54,11 @@ def load_changed(path: Path, changes: Collection[str]) -> Scene:
         SessionError: a value is not valid.
         SceneError, SettingsError: the same, without changes.
     """
-    if not changes:
-        return load_scene(str(path))
     try:
         return load_scene(str(path))
     except (SceneError, SettingsError) as error:
+        if not changes:
+            raise
         said = re.sub(rf'^{re.escape(str(path))}(:\d+)?: ', '', str(error))
         raise SessionError(f'--with {", ".join(changes)}: {said}') from None
 

@@ -9,10 +9,10 @@ from typing import Any, get_args
 import pytest
 
 from cutting_trainer.haptic_bridge.scene_schema import DeviceSettings
+from cutting_trainer.session.domain import RANGE
 from cutting_trainer.session.node_commands import (
     MODULES,
     PROFILES,
-    RANGE,
     node_environment,
     session_nodes,
 )

@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from cutting_trainer.node_common.share_folder import is_checkout, share_folder
-from cutting_trainer.session.node_commands import MODULES, PROFILES, RANGE
+from cutting_trainer.session.domain import RANGE
+from cutting_trainer.session.node_commands import MODULES, PROFILES
 
 pytestmark = pytest.mark.long
 

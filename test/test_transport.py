@@ -13,8 +13,9 @@ from xml.etree import ElementTree
 import pytest
 from live import PATIENCE, ROOT, free_domain, running
 
+from cutting_trainer.session.domain import RANGE
 from cutting_trainer.session.network import Network, network_environment
-from cutting_trainer.session.node_commands import PROFILES, RANGE, discovery, node_environment
+from cutting_trainer.session.node_commands import PROFILES, discovery, node_environment
 
 pytestmark = pytest.mark.long
 
