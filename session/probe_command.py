@@ -247,7 +247,7 @@ def _emulated(options: ProbeOptions, domain: int, guide: Guide | None) -> Iterat
         return
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / 'probe.yaml'
-        content = emulated_scene(options.emulation, options.force_topic, guide)
+        content = emulated_scene(options.emulation, options.force_topic, guide, moves=options.moves)
         scene.write_text(json.dumps(content))
         faults = {'faults': options.emulation.faults} if options.emulation.faults else {}
         command = arm_command(scene, auto_enable=False, wait_for_bridge=False, **faults)
@@ -263,14 +263,20 @@ def _emulated(options: ProbeOptions, domain: int, guide: Guide | None) -> Iterat
 
 
 def emulated_scene(
-    emulation: Emulation, force_topic: str, guide: Guide | None = None
+    emulation: Emulation,
+    force_topic: str,
+    guide: Guide | None = None,
+    *,
+    moves: bool = True,
 ) -> dict[str, Any]:
     """Return a scene in which the hand does what is asked once the arm is enabled."""
     if guide is not None:
         start = [*guide.points[0, :2].tolist(), float(guide.points[0, 2]) + LIFT_M]
         return _scripted(emulation, force_topic, start, guide.goals, 3 * HOLD_S)
-    moves = np.vstack([REQUESTED_MOVE_M * np.eye(3), [-RULER_LENGTH_M, 0.0, 0.0]])
-    goals: list[dict[str, Any]] = [{'position': p} for p in np.cumsum(moves, axis=0).tolist()]
+    if not moves:
+        return _scripted(emulation, force_topic, [0.0] * 3, [{'position': [0.0] * 3}], 1.5)
+    steps = np.vstack([REQUESTED_MOVE_M * np.eye(3), [-RULER_LENGTH_M, 0.0, 0.0]])
+    goals: list[dict[str, Any]] = [{'position': p} for p in np.cumsum(steps, axis=0).tolist()]
     goals.append(goals[-1] | {'rpy_deg': [0.0, 0.0, QUARTER_TURN_DEG]})
     return _scripted(emulation, force_topic, [0.0, 0.0, 0.0], goals, 1.5)
 

@@ -56,6 +56,16 @@ def test_a_driver_that_gets_everything_wrong_is_told_so(capsys):
 
 
 @pytest.mark.thorough
+def test_an_arm_at_rest_is_enabled_to_be_pushed(capsys):
+    faults = Emulation(faults='turn=30 gain=5')
+    status, checks = found(capsys, emulation=faults, push=True, moves=False)
+    assert status == Status.FAILED
+    assert checks['force']['verdict'] == checks['gain']['verdict'] == 'wrong', checks
+    assert checks['release']['verdict'] == 'ok'
+    assert 'unit' not in checks
+
+
+@pytest.mark.thorough
 def test_an_arm_that_is_wrong_in_every_way_is_told_so_in_every_way(capsys):
     wrong = Emulation(
         arm={'rate': 200.0},

@@ -232,13 +232,15 @@ class DeviceProbe(Node):
         return name
 
     def enable(self) -> None:
-        """Enable the device."""
+        """Enable the device, and wait until it says so."""
         topic = f'{self._arm}/state_command'
         publisher = self.create_publisher(self._types.command, topic, EVENTS)
         deadline = time.monotonic() + FIRST_POSE_TIMEOUT_S
         while not publisher.get_subscription_count() and time.monotonic() < deadline:
             time.sleep(0.02)
         publisher.publish(self._types.command(string='enable'))
+        while self.state(_REST) != 'ENABLED' and time.monotonic() < deadline:
+            pass
 
     def push(self, metres: float) -> 'Pushes':
         """Push the tip slowly along each axis and back, release it, then stop commanding.
