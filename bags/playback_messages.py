@@ -14,6 +14,8 @@ from cutting_trainer.node_common.cdr_codec import PoseStampedCodec, StampedMessa
 
 _BATCH, _BATCHES = 500, 4
 """Messages that are read before they are due: 0.3 s of a session or more."""
+_HALF_A_DIGIT_S = 0.0005
+"""By which the duration of a bag is rounded where it is told [s]."""
 
 
 class ReadAhead:
@@ -165,7 +167,7 @@ def require_moment(bag: Bag, seconds: float) -> None:
         BagError: it is before the bag or after it.
     """
     end = duration(bag)
-    if not 0.0 <= seconds <= round(end, 3):
+    if not 0.0 <= seconds <= end + _HALF_A_DIGIT_S:
         folder = bag.path if bag.path.is_dir() else bag.path.parent
         said = f'{folder} lasts from 0 to {end:.3f} s'
         raise BagError(f'{said}: there is no tissue at {seconds:g} s')

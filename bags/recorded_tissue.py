@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from cutting_trainer.bags.errors import BagError
-from cutting_trainer.bags.playback_messages import first_time
+from cutting_trainer.bags.playback_messages import first_time, require_moment
 from cutting_trainer.bags.reader import Bag, Recorded
 from cutting_trainer.bags.topic_names import MESH, UPDATES
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
@@ -18,10 +18,10 @@ def tissue_at(bag: Bag, seconds: float | None = None) -> MeshReplica:
             that one.
 
     Raises:
-        BagError: there is no keyframe, or the moment is before the bag.
+        BagError: there is no keyframe, or the moment is not in the bag.
     """
-    if seconds is not None and seconds < 0.0:
-        raise BagError(f'{bag.path} begins at 0 s: there is no tissue at {seconds:g} s')
+    if seconds is not None:
+        require_moment(bag, seconds)
     replica = MeshReplica()
     origin = first_time(bag)
     for recorded in tissue_messages(bag):

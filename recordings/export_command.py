@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import parquet as pq
 
-from cutting_trainer.bags.playback_messages import first_time, require_moment
+from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.recorded_tissue import tissue_at
 from cutting_trainer.bags.topic_names import CONTACT, FORCE, OF_DEVICE, SERVO_CF, of_session
@@ -58,8 +58,6 @@ def export(folder: Path, output: Path, at: float | None, *, parquet: bool = Fals
     bag = open_bag(folder)
     if not output.parent.is_dir():
         raise SessionError(f'{output.parent} does not exist: make it first')
-    if at is not None:
-        require_moment(bag, at)
     if output.suffix in SOLIDS + SURFACES:
         write_mesh(tissue_at(bag, at), output)
         return [output]

@@ -72,8 +72,6 @@ def make_picture(bag: Path, file: Path, at: float | None) -> None:
         raise SessionError(f'{file} is no picture: give it an extension of {", ".join(FORMATS)}')
     if file.parent != bag and not file.parent.is_dir():
         raise SessionError(f'{file.parent} does not exist: make it first, the picture goes into it')
-    if at is not None:
-        require_moment(open_bag(bag), at)
     story = read_story(bag, at)
     with mpl.rc_context(STYLE):
         draw(story).savefig(file, dpi=130)
@@ -94,6 +92,8 @@ def read_story(bag: Path, at: float | None) -> Story:
     tool, forces = [], []
     start, time = 0, 0.0
     opened = open_bag(bag)
+    if at is not None:
+        require_moment(opened, at)
     servo_cf = of_session(SERVO_CF, opened.topics())
     first = first_current_keyframe(opened)
     known_from = 0 if first is None else first.log_time
