@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 DIFFERENCE = 0.2
 """Step of the central differences of logarithms: a cut goes on from element to element, and a
-smaller step divides its jumps by less."""
+smaller step divides its jumps by less. Slopes are taken again where the search is further away."""
 START_POINTS = 3
 """Points of the start's design for each unknown."""
 MAX_STEPS = 8
@@ -55,6 +55,8 @@ Point = tuple[float, ...]
 """Values of the unknown constants, in their order and units."""
 Compute = Callable[[Iterable[tuple[int, Point]]], dict[tuple[int, Point], Floats]]
 """Returns computed forces [N], shape (n, 3), by number of bag and point; NaN where it failed."""
+Slopes = dict[tuple[int, int], Floats]
+"""Change of forces with a logarithm [N], shape (n, 3), by number of bag and of the unknown."""
 
 
 class Fit:
@@ -65,6 +67,7 @@ class Fit:
         priors: of the unknowns, by name.
         noise: of the force for one sample of one component [N].
         compute: re-simulates.
+        coarser: of the same bags on a coarser mesh, whose slopes serve where this one has none yet.
     """
 
     def __init__(
@@ -73,8 +76,10 @@ class Fit:
         priors: dict[str, Prior],
         noise: float,
         compute: Compute,
+        coarser: 'Fit | None' = None,
     ) -> None:
         self._observations, self._priors, self._compute = observations, priors, compute
+        self._coarser = coarser
         self._without_jumps = [deviations(o.times, o.felt, noise) for o in observations]
         self._deviations = list(self._without_jumps)
         self._felt = [window_means(o.times, o.felt) for o in observations]
@@ -82,6 +87,7 @@ class Fit:
         self._spread = np.array([prior.spread for prior in priors.values()])
         self._known: dict[tuple[int, Point], Floats] = {}
         self._untouched: set[tuple[int, int]] = set()
+        self._slopes: list[tuple[Floats, Slopes]] = []
         self._scale = 1.0
 
     def solve(self, begin: Floats, confidence: float) -> Linearised:
@@ -98,22 +104,14 @@ class Fit:
         low, high = np.minimum(self._mean, begin) - bound, np.maximum(self._mean, begin) + bound
         at = begin
         for _ in range(MAX_SEARCHES):
-            at = least_squares(
-                self._objective,
-                at,
-                jac=self._slope,
-                bounds=(low, high),
-                x_scale=self._spread,
-                loss='soft_l1',
-                xtol=_TOLERANCE,
-                ftol=_TOLERANCE,
-                max_nfev=MAX_STEPS,
-            ).x
+            at = self._search(at, low, high)
             better = self._better_end(at, low, high)
             if better is None:
                 break
             at = better
-        self._allow_for_jumps(at)
+        at = self._search(at, low, high)  # by the slopes that are taken there
+        centre, _ = self._slopes_near(at)
+        self._allow_for_jumps(centre)
         return Linearised(
             names=tuple(self._priors),
             at=at,
@@ -125,15 +123,31 @@ class Fit:
             deviations=self._deviations,
         )
 
+    def _search(self, at: Floats, low: Floats, high: Floats) -> Floats:
+        """Return the end of a search from a point, within bounds, each of shape (p,)."""
+        found = least_squares(
+            self._objective,
+            at,
+            jac=self._slope,
+            bounds=(low, high),
+            x_scale=self._spread,
+            loss='soft_l1',
+            xtol=_TOLERANCE,
+            ftol=_TOLERANCE,
+            max_nfev=MAX_STEPS,
+        )
+        return np.asarray(found.x)
+
     def _better_end(self, at: Floats, low: Floats, high: Floats) -> Floats | None:
         """Return the best end of the central differences that fits better than a point, or None.
 
-        Jumps of a cut stop a search where a step away the fit is better.
+        Jumps of a cut stop a search where a step away the fit is better. Slopes are taken here.
 
         Args:
             at: logarithms of the constants, and
             low, high: their bounds, each shape (p,).
         """
+        self._slopes_at(at)
         ends = [np.log(end) for pair in self._ends(at) for end in pair]
         within = [end for end in ends if (low <= end).all() and (end <= high).all()]
         best = min([at, *within], key=lambda end: _loss(self._objective(end)))
@@ -189,6 +203,27 @@ class Fit:
         return self._weighted(bag, felt - computed)
 
     def _jacobians(self, at: Floats) -> list[Floats]:
+        """Return slopes of the weighted window means near a point, each of shape (3 windows, p)."""
+        _, slopes = self._slopes_near(at)
+        unknowns = range(len(at))
+        return [
+            np.column_stack([
+                self._weighted(bag, slopes[bag, i]) if (bag, i) in slopes else np.zeros(felt.size)
+                for i in unknowns
+            ])
+            for bag, felt in enumerate(self._felt)
+        ]  # fmt: skip
+
+    def _slopes_near(self, at: Floats) -> tuple[Floats, Slopes]:
+        """Return the nearest slopes within a step of the differences, and where they were taken."""
+        known = self._slopes or (self._coarser._slopes if self._coarser else [])
+        away = [float(np.abs(at - centre).max()) for centre, _ in known]
+        if away and min(away) <= DIFFERENCE:
+            return known[int(np.argmin(away))]
+        return at, self._slopes_at(at)
+
+    def _slopes_at(self, at: Floats) -> Slopes:
+        """Take the slopes of the forces at a point."""
         bags, unknowns, ends = range(len(self._observations)), range(len(at)), self._ends(at)
         touched = [(bag, i) for bag in bags for i in unknowns if (bag, i) not in self._untouched]
         self._need([(bag, point) for bag, i in touched for point in ends[i]])
@@ -200,17 +235,14 @@ class Fit:
             failed = [bool(np.isnan(end).any()) for end in (up, down)]
             width = 2.0 * DIFFERENCE if not any(failed) else DIFFERENCE
             up, down = (between if failed[0] else up), (between if failed[1] else down)
-            slopes[bag, i] = self._weighted(bag, up - down) / width
-            if not any(failed) and np.array_equal(
-                up, down
-            ):  # a hand that does not cut never meets the toughness
-                self._untouched.add((bag, i))
-        return [
-            np.column_stack(
-                [slopes.get((bag, i), np.zeros(self._felt[bag].size)) for i in unknowns]
-            )
-            for bag in bags
-        ]
+            slopes[bag, i] = (up - down) / width
+            if not any(failed) and np.array_equal(up, down):
+                self._untouched.add((bag, i))  # as the toughness where a hand does not cut
+        for bag, i in self._untouched:
+            middle = self._known[bag, self._point(at)]
+            self._known = dict.fromkeys([(bag, point) for point in ends[i]], middle) | self._known
+        self._slopes.append((at, slopes))
+        return slopes
 
     def _ends(self, at: Floats) -> list[tuple[Point, Point]]:
         """Return the ends of the central difference along each unknown."""
@@ -218,12 +250,11 @@ class Fit:
         return [(self._point(at + step), self._point(at - step)) for step in steps]
 
     def _allow_for_jumps(self, at: Floats) -> None:
-        """Widen the deviations by the jumps of the computed forces around a point.
+        """Widen the deviations by the jumps of the computed forces where slopes were taken.
 
         A tissue that breaks in or parts a little earlier changes a force at once. Such jumps, of
         the same variance at three points, have six times that variance as a second difference.
         """
-        self._jacobians(at)  # computes them
         for bag, without in enumerate(self._without_jumps):
             middle = self._known[bag, self._point(at)]
             second = [

@@ -187,7 +187,8 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
             str(write_refined(read_recording(str(bag.path), bag.hash).bag, folder, options.changes))
             for bag in bags
         ]
-        fit = Fit(observations, priors, options.noise, partial(running.compute, meshes=refined))
+        again = partial(running.compute, meshes=refined)
+        fit = Fit(observations, priors, options.noise, again, coarser=fit)
         problem = fit.solve(coarse, CONFIDENCE)
         problem = replace(problem, mesh_change=problem.estimates - coarse)
     return Identification(

@@ -103,7 +103,24 @@ def test_a_search_that_stops_where_a_step_away_the_fit_is_better_begins_anew(mon
     observed = [Observation(TIMES, law(bag, *TRUTH.values())) for bag in range(3)]
     found = Fit(observed, PRIORS, NOISE, compute).solve(np.log([5000.0, 150.0]), 0.95)
     assert np.exp(found.estimates) == pytest.approx(list(TRUTH.values()), rel=0.02)
-    assert len(begins) == 2 and begins[1][0] == pytest.approx(5000.0 * np.exp(fit.DIFFERENCE))
+    assert len(begins) == 3 and begins[1][0] == pytest.approx(5000.0 * np.exp(fit.DIFFERENCE))
+
+
+def test_slopes_of_the_coarser_mesh_lead_to_the_solution_of_the_finer_one() -> None:
+    asked = []
+
+    def softer(wanted: Iterable[tuple[int, tuple[float, ...]]]) -> dict:
+        asked.extend(wanted := list(wanted))
+        return {(bag, point): 0.9 * law(bag, *point) for bag, point in wanted}
+
+    observed = [Observation(TIMES, law(bag, *TRUTH.values())) for bag in range(3)]
+    coarse = Fit(observed, PRIORS, NOISE, compute)
+    begin = coarse.solve(np.log([5000.0, 200.0]), 0.95).estimates
+    alone = Fit(observed, PRIORS, NOISE, softer).solve(begin, 0.95)
+    sessions = len(asked)
+    led = Fit(observed, PRIORS, NOISE, softer, coarse).solve(begin, 0.95)
+    assert led.estimates == pytest.approx(alone.estimates, abs=2e-3)
+    assert len(asked) - sessions < sessions
 
 
 def problem(columns: list[np.ndarray], names: tuple[str, ...]) -> Linearised:
