@@ -30,7 +30,8 @@ _START_BAGS = 3
 _START_SPREAD = 1.5
 """Half of the design's range, and _BOUND that of the search, in spreads of the prior."""
 _BOUND = 3.0
-_TOLERANCE = 1e-3
+_TOLERANCE = 3e-3
+"""Of a search, in shares of the logarithms: 3 % of a constant. A Gauss-Newton step follows."""
 _FAILED = 10.0
 """Residual of a point that cannot be computed, in recorded forces."""
 _SEED = 0
@@ -109,9 +110,8 @@ class Fit:
             if better is None:
                 break
             at = better
-        at = self._search(at, low, high)  # by the slopes that are taken there
-        centre, _ = self._slopes_near(at)
-        self._allow_for_jumps(centre)
+        self._slopes_at(at)
+        self._allow_for_jumps(at)
         return Linearised(
             names=tuple(self._priors),
             at=at,
@@ -250,7 +250,7 @@ class Fit:
         return [(self._point(at + step), self._point(at - step)) for step in steps]
 
     def _allow_for_jumps(self, at: Floats) -> None:
-        """Widen the deviations by the jumps of the computed forces where slopes were taken.
+        """Widen the deviations by the jumps of the computed forces around a point with slopes.
 
         A tissue that breaks in or parts a little earlier changes a force at once. Such jumps, of
         the same variance at three points, have six times that variance as a second difference.

@@ -13,7 +13,7 @@ from cutting_trainer.session.in_process import Tissue
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 TOP, EDGE, COUPLING, STIFF = 0.02, 0.03, 400.0, 30000.0

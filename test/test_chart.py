@@ -26,7 +26,7 @@ from bench.common.meshes import end_load, kuhn_block
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.assembly import make_task
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 pytestmark = pytest.mark.long

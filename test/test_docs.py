@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -94,6 +95,24 @@ def test_every_file_that_a_document_names_is_there(page: Path) -> None:
     for name in re.findall(rf'`({folders}/[\w./-]*\w\.(?:py|md|yaml|xml|msg|srv))`', TEXTS[page]):
         if name != 'config/devices/my_arm.yaml':
             assert (ROOT / name).is_file(), f'{page.name}: {name}'
+
+
+@cache
+def sources() -> dict[str, str]:
+    """Text of each of our modules, by its path below the root."""
+    folders = [ROOT / 'test', *(path.parent for path in ROOT.glob('*/__init__.py'))]
+    paths = [path for folder in folders for path in folder.rglob('*.py')]
+    return {f'/{path.relative_to(ROOT)}': path.read_text(encoding='utf-8') for path in paths}
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_every_module_and_method_that_a_document_names_is_there(page: Path) -> None:
+    for name in re.findall(r'`((?:\w+/)*[a-z_]+\.py)`', TEXTS[page]):
+        file = ROOT / name
+        assert file.is_file() or any(path.endswith(f'/{name}') for path in sources()), name
+    for owner, method in re.findall(r'`([A-Z]\w+)\.(\w+)`', TEXTS[page]):
+        homes = [text for text in sources().values() if re.search(rf'^class {owner}\b', text, re.M)]
+        assert not homes or any(re.search(rf'\b{method}\b', text) for text in homes), method
 
 
 # Topics and services: what the tables say, and what the nodes make.

@@ -8,14 +8,16 @@ from meshes import box
 
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
+from cutting_trainer.tissue_sim.elasticity.elastic_force import stiffness_product
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName, stiffness_product
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.far_field import FarField
 from cutting_trainer.tissue_sim.motion.far_relaxation import LENGTHS
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 pytestmark = pytest.mark.long
 
@@ -181,7 +183,7 @@ def test_a_region_that_goes_on_makes_no_jump_and_a_body_at_rest_stays_at_rest(
     dynamics = Dynamics(
         mesh, TISSUE, model, TimeStepping('symplectic_euler'), ActiveSettings('budget', NODES)
     )
-    free = dynamics.inverse_mass > 0
+    free = dynamics.mass.inverse > 0
     elastic = ElasticModel(slab(), TISSUE, 'linear_smoothed')
     dynamics.resume(solve_static(elastic, free, load))
     dynamics.model.load = load.ravel()

@@ -14,8 +14,9 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 E, DENSITY, G, LENGTH = 5400.0, 1060.0, 0.5, 0.08
 Vector = tuple[float, float, float]
@@ -71,13 +72,15 @@ def test_mass_that_is_added_for_the_step_weighs_nothing() -> None:
     found = []
     for growth in (np.inf, 1.0):
         dynamics = bar('linear', growth=growth)
-        dynamics._frequency._ceiling *= 1.0 if growth > 1.0 else 0.5
-        dynamics._follow_cut(np.arange(dynamics.mesh.node_count))
+        dynamics.mass._frequency._ceiling *= 1.0 if growth > 1.0 else 0.5
+        dynamics.mass.follow_cut(np.arange(dynamics.mesh.node_count))
         dynamics.settle()
         for _ in range(20):
             dynamics.advance(Coupling(FREE))
         found.append(elongation(dynamics))
-        heavier = dynamics._inertia[: dynamics.mesh.node_count].sum() / dynamics.model.mass.sum()
+        heavier = (
+            dynamics.mass._inertia[: dynamics.mesh.node_count].sum() / dynamics.model.mass.sum()
+        )
     assert heavier > 1.5
     assert found[1] == pytest.approx(found[0], rel=1e-4)
 

@@ -103,7 +103,7 @@ def test_a_search_that_stops_where_a_step_away_the_fit_is_better_begins_anew(mon
     observed = [Observation(TIMES, law(bag, *TRUTH.values())) for bag in range(3)]
     found = Fit(observed, PRIORS, NOISE, compute).solve(np.log([5000.0, 150.0]), 0.95)
     assert np.exp(found.estimates) == pytest.approx(list(TRUTH.values()), rel=0.02)
-    assert len(begins) == 3 and begins[1][0] == pytest.approx(5000.0 * np.exp(fit.DIFFERENCE))
+    assert len(begins) == 2 and begins[1][0] == pytest.approx(5000.0 * np.exp(fit.DIFFERENCE))
 
 
 def test_slopes_of_the_coarser_mesh_lead_to_the_solution_of_the_finer_one() -> None:

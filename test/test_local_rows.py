@@ -5,8 +5,9 @@ import pytest
 from meshes import irregular_box
 from test_active_region import palpated
 
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName, internal_force
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName

@@ -15,7 +15,8 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister, free_parts, pieces_of
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.node import TissueSimNode
 
 SIZE = np.array([0.06, 0.06, 0.012])

@@ -30,7 +30,8 @@ from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, M
 from cutting_trainer.tissue_sim.mesh.locate import NearElements
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.scene_schema import RegionSettings, TissueSettings
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.simulation.state import from_state, state_of

@@ -5,12 +5,8 @@ import pytest
 from numba import njit
 
 from bench.speed.tissue import box, liver_material
-from cutting_trainer.tissue_sim.elasticity.models import (
-    MODELS,
-    ElasticModel,
-    ModelName,
-    internal_force,
-)
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import NodalSmoothing
 from cutting_trainer.tissue_sim.elasticity.simd import (
     add_three,

@@ -18,8 +18,9 @@ from cutting_trainer.tissue_sim.elasticity.models import ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 RESISTANCE = Resistance(100.0, 40.0, 0.0)
@@ -192,9 +193,9 @@ def test_after_a_cut_through_elements_the_bound_holds_and_the_lips_come_to_rest(
     """Cut at the true crossings: the method that makes slivers."""
     tissue = cut_block(name, integrator, 'subdivide')
     dynamics = tissue.dynamics
-    root = np.sqrt(dynamics.inverse_mass)
+    root = np.sqrt(dynamics.mass.inverse)
     true = np.sqrt(np.linalg.eigvalsh(root[:, None] * dynamics.model.dense() * root)[-1])
-    assert true < dynamics.omega
+    assert true < dynamics.mass.omega
     rng = np.random.default_rng(0)
     free = tissue.mesh.fixed == 0
     tissue.displacement[free] += 2e-5 * rng.normal(size=(int(free.sum()), 3))
@@ -311,7 +312,7 @@ class _Entering:
 def test_the_step_follows_a_spring_that_is_new_within_a_frame() -> None:
     tissue = simulation(integrator='symplectic_euler').dynamics
     node = int(np.flatnonzero(tissue.mesh.fixed == 0)[0])
-    stiffness = 3.0 * tissue.omega**2 * float(tissue.model.mass[node])
+    stiffness = 3.0 * tissue.mass.omega**2 * float(tissue.model.mass[node])
     place = tissue.mesh.rest[node] + [0.0, 0.0, 1e-5]
     calm = tissue.advance(Coupling())
     motion = tissue.advance(Coupling(), tools=[_Entering(node, place, stiffness)])

@@ -19,9 +19,10 @@ from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 from cutting_trainer.tissue_sim.motion.stability import step_bound
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 pytestmark = pytest.mark.long
 
@@ -79,7 +80,7 @@ def dynamics_of(block: Block, name: ModelName, stepping: TimeStepping) -> Dynami
 def highest(block: Block, name: ModelName) -> float:
     """The highest frequency [rad/s], small nodes with the mass that they got by the cut."""
     dynamics = dynamics_of(block, name, TimeStepping('rk4'))
-    root = np.sqrt(dynamics.inverse_mass)
+    root = np.sqrt(dynamics.mass.inverse)
     stiffness = root[:, None] * dynamics.model.dense() * root
     return float(np.sqrt(np.linalg.eigvalsh(stiffness)[-1]))
 

@@ -63,7 +63,7 @@ from bench.speed.tissue import box, liver_material
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.elasticity.models import MODELS
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation

@@ -14,7 +14,7 @@ from cutting_trainer.tissue_sim.mesh.files import load_labelled_mesh, load_mesh
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.planner.candidate import Task
 from cutting_trainer.tissue_sim.planner.memory import recall, remember
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan

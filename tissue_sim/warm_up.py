@@ -25,8 +25,9 @@ from cutting_trainer.tissue_sim.mesh.locate import (
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 _FRAMES = 40

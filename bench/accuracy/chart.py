@@ -21,7 +21,7 @@ from bench.accuracy.region import LocalPalpation, describe
 from bench.accuracy.vibration import Vibration
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 THESIS = ('linear', 'rk4')

@@ -16,7 +16,7 @@ from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.planner.far_field_errors import FarFieldTrial
 from cutting_trainer.tissue_sim.planner.indentation import Indenter
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation

@@ -33,7 +33,7 @@ from cutting_trainer.tissue_sim.contact.tool import (
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.cut_transaction import CutTransaction
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder

@@ -14,8 +14,9 @@ from bench.common.meshes import kuhn_block
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 _MAX_SUBSTEPS = 100_000
 """More substeps than any method needs in a frame."""

@@ -38,7 +38,8 @@ from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.material_presets import PRESETS
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.mesh.topology import CUT
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 Floats = NDArray[np.float64]
 

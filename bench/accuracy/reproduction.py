@@ -22,8 +22,8 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import CUT
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.planner.budget import Budget
 from cutting_trainer.tissue_sim.planner.candidate import Task
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation

@@ -12,7 +12,8 @@ from bench.common.meshes import PLANE_TOLERANCE_M, beam
 from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 Floats = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from cutting_trainer.tissue_sim.contact.coupling import HOLD, Coupling
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact, indenter_contact
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 SIZE_M = np.array([0.025, 0.02, 0.02])

@@ -11,8 +11,9 @@ from cutting_trainer.tissue_sim.contact.coupling import Coupling
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.checks import EDGES, components
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 _MATERIAL = Material(10000.0, 0.45, 1000.0, 15.0, 2e-4)
 _STRAIN = 0.05

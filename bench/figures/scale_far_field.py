@@ -18,7 +18,8 @@ from bench.accuracy.far_field_session import (
 )
 from bench.accuracy.footprint import MATERIAL, block
 from bench.figures.figure import Figure
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName, internal_force
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 
 _SEED, _PLACE = 21, (0.044, 0.056)

@@ -10,8 +10,9 @@ from bench.accuracy.law_problems import unstructured_block as block_of
 from bench.common.meshes import kuhn_block
 from bench.cuts.random_loads import MAX_AWAY, torture
 from bench.figures.figure import Figure
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName, internal_force
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, ModelName
 
 STIFFENING = 6.0
 EDGE_M = 0.006

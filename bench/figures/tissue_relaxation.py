@@ -13,8 +13,9 @@ from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.motion.dynamics import Dynamics, TimeStepping
+from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 
 SIDE = 0.03
 Series = tuple[tuple[float, float], ...]
@@ -87,11 +88,11 @@ def pulled(
     material = Material(*MODULI, 10.0, 200.0, 1e-4, 0.0, series)
     stepping = TimeStepping(integrator, max_substeps=5000)
     dynamics = Dynamics(mesh, material, name, stepping, gravity=(0.0, 0.0, PULL))
-    dynamics.inverse_mass.reshape(-1, 3)[mesh.rest < 1e-9] = 0.0  # planes that slide in themselves
+    dynamics.mass.inverse.reshape(-1, 3)[mesh.rest < 1e-9] = 0.0  # planes that slide in themselves
     top = mesh.rest[:, 2] > SIDE - 1e-9
     weight = np.zeros_like(mesh.rest)
     weight[:, 2] = PULL * dynamics.model.mass
-    first = solve_static(dynamics.model, dynamics.inverse_mass > 0, weight)[top, 2].mean()
+    first = solve_static(dynamics.model, dynamics.mass.inverse > 0, weight)[top, 2].mean()
     return dynamics, lambda: float(dynamics.displacement[top, 2].mean() / first)
 
 

@@ -15,7 +15,7 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica, state_hash
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, Touched
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder, mesh_message
 

@@ -18,7 +18,7 @@ from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder
 from cutting_trainer.tissue_sim.warm_up import warm_up
@@ -121,8 +121,8 @@ def _tissue(mesh: TetMesh, active: ActiveSettings) -> TissueSimulation:
 
 def _step(simulation: TissueSimulation) -> float:
     dynamics, count = simulation.dynamics, 8
-    dt = 0.8 * dynamics.bound()
-    steps = steps_of(simulation.model, dynamics.inverse_mass, 'symplectic_euler', dt, count)
+    dt = 0.8 * dynamics.steps.bound()
+    steps = steps_of(simulation.model, dynamics.mass.inverse, 'symplectic_euler', dt, count)
     return 1e3 * float(np.median(by_turns(steps))) / count
 
 

@@ -35,7 +35,7 @@ from cutting_trainer.tissue_sim.elasticity.models import ModelName
 from cutting_trainer.tissue_sim.mesh.locate import closest_triangle
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.mesh.topology import OUTER
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.warm_up import warm_up
 
@@ -224,9 +224,9 @@ class Session:
     def added_mass(self) -> float:
         """Added mass as a share of the tissue's own [-]."""
         dynamics = self.simulation.dynamics
-        free = dynamics.inverse_mass[::3] > 0
+        free = dynamics.mass.inverse[::3] > 0
         mass = dynamics.model.mass[free]
-        return float((1.0 / dynamics.inverse_mass[::3][free]).sum() / mass.sum() - 1.0)
+        return float((1.0 / dynamics.mass.inverse[::3][free]).sum() / mass.sum() - 1.0)
 
     @property
     def bytes(self) -> int:

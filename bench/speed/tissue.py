@@ -13,18 +13,14 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.coupling import NO_SPRINGS
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import (
-    MODELS,
-    ElasticModel,
-    ModelName,
-    internal_force,
-)
+from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
 from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, Integrator, IntegratorName
 from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.streaming.messages import DeltaEncoder
 

@@ -27,7 +27,7 @@ from cutting_trainer.tissue_sim.contact.blade import Resistance, Sweep
 from cutting_trainer.tissue_sim.contact.tool import ContactState
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.motion.dynamics import TimeStepping
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 SHEET = (0.048, 0.012, 0.004)

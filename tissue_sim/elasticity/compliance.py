@@ -4,7 +4,8 @@ import numpy as np
 
 from cutting_trainer.node_common.errors import MeshError
 from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, stiffness_product
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands, stiffness_product
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.adjacency import PATCH, spans_of, without
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
 

@@ -11,51 +11,30 @@
 with w = PLAIN_SHARE. Parts that a model lacks cost nothing, so one kernel serves all models.
 """
 
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from cutting_trainer.node_common.errors import MeshError
-from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.tissue_sim.elasticity.adaptive_law import (
-    NO_LAW,
-    Law,
-    add_law_bounds,
-    add_law_forces,
-)
-from cutting_trainer.tissue_sim.elasticity.coarse_rows import (
-    NO_COARSE_ROWS,
-    CoarseRows,
-    lead_far_nodes,
-    put_coarse_forces,
-)
-from cutting_trainer.tissue_sim.elasticity.corotational import (
-    CorotationalElements,
-    Elements,
-    add_elements,
+from cutting_trainer.tissue_sim.elasticity.adaptive_law import NO_LAW, Law
+from cutting_trainer.tissue_sim.elasticity.coarse_rows import NO_COARSE_ROWS
+from cutting_trainer.tissue_sim.elasticity.corotational import CorotationalElements, Elements
+from cutting_trainer.tissue_sim.elasticity.elastic_force import (
+    ModelPart,
+    Operands,
+    internal_force,
+    stiffness_product,
 )
 from cutting_trainer.tissue_sim.elasticity.local_rows import (
     MAX_LOCAL_NODES,
     NO_LOCAL_ROWS,
-    Locality,
-    LocalRows,
-    local_product,
     locality,
 )
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import (
-    NodalSmoothing,
-    SmoothingDomains,
-    add_linear_smoothed_forces,
-    add_smoothed_forces,
-)
+from cutting_trainer.tissue_sim.elasticity.nodal_rows import assembled_norms, gather_incident_rows
+from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import NodalSmoothing, SmoothingDomains
 from cutting_trainer.tissue_sim.elasticity.rotation import LANES
-from cutting_trainer.tissue_sim.elasticity.tensor_mass import (
-    StiffnessRows,
-    TensorMass,
-    put_rows,
-    shape_gradients,
-)
+from cutting_trainer.tissue_sim.elasticity.tensor_mass import StiffnessRows, TensorMass
 from cutting_trainer.tissue_sim.mesh.adjacency import (
     NodeAdjacency,
     chunks_around,
@@ -63,7 +42,6 @@ from cutting_trainer.tissue_sim.mesh.adjacency import (
     nodes_of_chunks,
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, Touched, grown
-from cutting_trainer.tissue_sim.mesh.topology import of_region
 
 ModelName = Literal[
     'linear', 'linear_smoothed', 'corotational', 'corotational_smoothed', 'stiffening'
@@ -79,233 +57,6 @@ of plain elements without lambda, which has the six rigid motions and no other z
 STRAIN_TOLERANCE = 0.05
 """Change of shape or direction |F - I| up to which the stiffening model is linear; in elements,
 which have no part in volume and a smaller one in shear, twice as much."""
-
-
-class Operands(NamedTuple):
-    """Operands of the kernels for a model.
-
-    Attributes:
-        rows: tensors, or no rows.
-        domains: smoothing domains of nodes, or none.
-        elements: corotational elements, or none.
-        rotating: 1 if domains and elements rotate with the tissue, else 0.
-        awake: intervals of nodes whose rows are evaluated, shape (s, 2).
-        spans: intervals of evaluated domains: `awake`, and those of further regions at its nodes.
-        reach: intervals of nodes read and written by these, shape (s, 2).
-        chunks: evaluated chunks of elements, shape (k,).
-        local: complete rows of a part with its own numbering of u and f, or none.
-        law: of domains and elements, instead of corotation, or none.
-        load: forces to subtract from the elastic ones [N], by coordinate; (0,): none.
-        coarse: unknowns after the nodes that move far nodes, or none.
-    """
-
-    rows: StiffnessRows
-    domains: SmoothingDomains
-    elements: Elements
-    rotating: int
-    awake: np.ndarray
-    spans: np.ndarray
-    reach: np.ndarray
-    chunks: np.ndarray
-    local: LocalRows
-    law: Law
-    load: np.ndarray
-    coarse: CoarseRows
-
-
-class ModelPart(NamedTuple):
-    """Some nodes with a numbering of their own.
-
-    Attributes:
-        place: the nodes and their numbers.
-        operands: for the force on them, by these numbers.
-    """
-
-    place: Locality
-    operands: Operands
-
-
-@inner(error_model='numpy')
-def _begin(operands, u, f):
-    """Write the forces of the tensors in all of reach, 0 where there are none."""
-    rows, awake, reach = operands.rows, operands.awake, operands.reach
-    n = rows.used.shape[0]
-    if n == 0 or awake.shape[0] != 1 or awake[0, 1] - awake[0, 0] < n:
-        for s in range(reach.shape[0]):
-            f[3 * reach[s, 0] : 3 * reach[s, 1]] = 0.0
-    put_rows(rows, awake, u, f)
-
-
-@kernel(error_model='numpy')
-def internal_force(operands, u, f, rotation_steps):
-    """Compute the elastic force that resists a displacement, less the load of the operands.
-
-    Args:
-        operands: of the model; its rotations, if any, follow u.
-        u: displacement by coordinate [m], shape (3 n,).
-        f: output [N]: exact at nodes with only awake neighbours, 0 or partial elsewhere in reach,
-            unchanged beyond, shape (3 n,).
-        rotation_steps: iterations of the rotations; negative: until convergence.
-
-    Returns:
-        Elastic energy of domains and elements [J]; with a law, that of all if rotation_steps is
-        negative.
-    """
-    lead_far_nodes(operands.coarse, u, 1.0)
-    energy = _elastic_force(operands, u, f, rotation_steps)
-    if operands.load.shape[0] > 0:
-        _subtract(operands.load, operands.reach, f)
-    put_coarse_forces(operands.coarse, u, f, 1.0)
-    return energy
-
-
-@inner(error_model='numpy')
-def _subtract(load, reach, f):
-    for s in range(reach.shape[0]):
-        for i in range(3 * reach[s, 0], min(3 * reach[s, 1], load.shape[0])):
-            f[i] -= load[i]
-
-
-@inner(error_model='numpy')
-def _elastic_force(operands, u, f, rotation_steps):
-    if operands.local.first.shape[0] > 0:
-        local_product(operands.local, u, f)
-        return 0.0
-    _begin(operands, u, f)
-    if operands.law.domains.shape[0] > 0:
-        return add_law_forces(
-            operands.law, operands.domains, operands.elements, operands.awake, operands.spans,
-            operands.chunks, u, f, rotation_steps,
-        )  # fmt: skip
-    energy = 0.0
-    if operands.domains.used.shape[0] > 0 and not operands.rotating:
-        add_linear_smoothed_forces(operands.domains, operands.spans, u, f)
-    elif operands.domains.used.shape[0] > 0:
-        energy += add_smoothed_forces(operands.domains, operands.spans, u, f, rotation_steps, 1.0)
-    if operands.chunks.shape[0] > 0:
-        energy += add_elements(operands.elements, operands.chunks, u, f, rotation_steps, 1.0)
-    return energy
-
-
-@kernel(error_model='numpy')
-def stiffness_product(operands, x, f):
-    """Compute f = K x under the present rotations.
-
-    Args:
-        operands: of the model.
-        x: by coordinate, shape (3 n,).
-        f: output, shape (3 n,).
-    """
-    lead_far_nodes(operands.coarse, x, 0.0)
-    _stiffness_product(operands, x, f)
-    put_coarse_forces(operands.coarse, x, f, 0.0)
-
-
-@inner(error_model='numpy')
-def _stiffness_product(operands, x, f):
-    _begin(operands, x, f)
-    if operands.law.domains.shape[0] > 0:
-        add_linear_smoothed_forces(operands.domains, operands.spans, x, f)
-        add_law_bounds(
-            operands.law, operands.domains, operands.elements, operands.spans, operands.chunks, x, f
-        )
-        return
-    if operands.domains.used.shape[0] > 0 and not operands.rotating:
-        add_linear_smoothed_forces(operands.domains, operands.spans, x, f)
-    elif operands.domains.used.shape[0] > 0:
-        add_smoothed_forces(operands.domains, operands.spans, x, f, 0, 0.0)
-    if operands.chunks.shape[0] > 0:
-        add_elements(operands.elements, operands.chunks, x, f, 0, 0.0)
-
-
-@kernel
-def gather_incident_rows(links, rest, nodes, constants, relative, densities, mass, diagonal, norms):
-    """Compute masses, diagonal and norms of plain elements' rows at some nodes.
-
-    Args:
-        links: connectivity.
-        rest: rest positions [m], shape (n, 3).
-        nodes: which, shape (r,).
-        constants: lambda [Pa], mu [Pa].
-        relative: stiffness by region, relative to these.
-        densities: by region [kg/m^3].
-        mass: output [kg] (thesis eq. 4.2), shape (>= n,).
-        diagonal: output [N/m], shape (>= 3 n,).
-        norms: output, sums of the Frobenius norms of the element blocks K_ij of row i [N/m];
-            element rotations do not change them, shape (>= n,).
-    """
-    lame_lambda, lame_mu = constants[0], constants[1]
-    g = np.empty((4, 3))
-    for node in nodes:
-        mass[node] = 0.0
-        norms[node] = 0.0
-        for i in range(3):
-            diagonal[3 * node + i] = 0.0
-        corner = links.first_corner[node]
-        while corner >= 0:
-            a = corner % 4
-            volume = shape_gradients(rest, links.tetrahedra, corner // 4, g)
-            mass[node] += 0.25 * of_region(links, corner // 4, densities) * volume
-            volume *= of_region(links, corner // 4, relative)
-            dot = volume * lame_mu * (g[a, 0] * g[a, 0] + g[a, 1] * g[a, 1] + g[a, 2] * g[a, 2])
-            both = volume * (lame_lambda + lame_mu)
-            for i in range(3):
-                diagonal[3 * node + i] += both * g[a, i] * g[a, i] + dot
-            for b in range(4):
-                dot = g[a, 0] * g[b, 0] + g[a, 1] * g[b, 1] + g[a, 2] * g[b, 2]
-                square = 0.0
-                for i in range(3):
-                    for k in range(3):
-                        value = lame_lambda * g[a, i] * g[b, k] + lame_mu * g[b, i] * g[a, k]
-                        if i == k:
-                            value += lame_mu * dot
-                        square += value * value
-                norms[node] += volume * np.sqrt(square)
-            corner = links.corner_next[corner]
-
-
-@kernel
-def assembled_norms(tensors, links, nodes, norms):
-    """Compute the sums of Frobenius norms of the assembled 3x3 blocks of some rows.
-
-    Args:
-        tensors: a `tensor_mass.Tensors`.
-        links: connectivity.
-        nodes: which rows, shape (r,).
-        norms: output [N/m], shape (>= n,).
-    """
-    seen = np.empty(256, np.int64)
-    for which in range(len(nodes)):
-        node = nodes[which]
-        d = tensors.diagonal[node]
-        total = np.sqrt(d[0] ** 2 + d[3] ** 2 + d[5] ** 2 + 2 * (d[1] ** 2 + d[2] ** 2 + d[4] ** 2))
-        number = 0
-        corner = links.first_corner[node]
-        while corner >= 0:
-            for b in range(4):
-                other = links.tetrahedra[corner // 4, b]
-                new = other != node
-                for k in range(number):
-                    if seen[k] == other:
-                        new = False
-                if new:
-                    total += _edge_norm(tensors, max(node, other), min(node, other))
-                    if number < 256:
-                        seen[number] = other
-                        number += 1
-            corner = links.corner_next[corner]
-        norms[node] = total
-
-
-@inner
-def _edge_norm(tensors, high, low):
-    for slot in range(tensors.start[high], tensors.start[high] + tensors.used[high]):
-        if tensors.columns[slot] == 3 * low:
-            square = 0.0
-            for i in range(9):
-                square += tensors.blocks[9 * slot + i] ** 2
-            return np.sqrt(square)
-    return 0.0
 
 
 _NO_ROWS = StiffnessRows(

@@ -12,8 +12,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands, internal_force
 from cutting_trainer.tissue_sim.elasticity.local_rows import Locality
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, internal_force
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.adjacency import intervals, without
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import Touched, grown
 

@@ -1,7 +1,6 @@
 """Dynamics of the tissue by frame: model, integrator, step, active region, divergence detector."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,46 +36,18 @@ from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
 from cutting_trainer.tissue_sim.motion.elastic_state import ElasticState
 from cutting_trainer.tissue_sim.motion.far_field import SHARES, FarField
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
-from cutting_trainer.tissue_sim.motion.integrators import Integrator, IntegratorName
+from cutting_trainer.tissue_sim.motion.integrators import Integrator
 from cutting_trainer.tissue_sim.motion.loads import Loads
-from cutting_trainer.tissue_sim.motion.stability import FrequencyBound, step_bound
-from cutting_trainer.tissue_sim.motion.stiffened_mass import SUBSTEPS_BETWEEN, StiffenedMass
+from cutting_trainer.tissue_sim.motion.nodal_mass import NodalMass
+from cutting_trainer.tissue_sim.motion.stiffened_mass import SUBSTEPS_BETWEEN
+from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping, TimeSteps
 
 _AT_REST = 1e-9
 """[m/s] below which an untouched tissue is at rest after `_STILL_FRAMES`."""
 _STILL_FRAMES = 10
-_FINER, _FINEST = 4, 16
-"""Refinement of the steps in the next attempt, and its limit. A frame then does no more work than
-21 frames, though frame after frame should need shorter steps; with explicit steps of a model
-without rotations, no more than 5: its bound holds in any shape, and steps shorter than a quarter do
-not help."""
-_CAUTIOUS_FRAMES = 30
 _DRAG = 10.0
 """Damping of loose pieces in proportion to mass, beside the tissue's own [1/s]: wet tissue sticks
 to its bed, which is not simulated, within centimetres."""
-
-
-@dataclass(frozen=True)
-class TimeStepping:
-    """Time stepping of frames.
-
-    Attributes:
-        integrator: name.
-        rate: frames a second [Hz].
-        safety: ratio of step to stable step.
-        min_substeps, max_substeps: of a frame; when the largest number does not suffice the frame
-            simulates less time than it lasts.
-        frequency_growth: largest growth of the highest frequency by cuts before small nodes are
-            integrated with more mass (see `FrequencyBound`); infinite: no limit. Below 1, those of
-            the mesh are too.
-    """
-
-    integrator: IntegratorName = 'rk4'
-    rate: float = 30.0
-    safety: float = 0.8
-    min_substeps: int = 1
-    max_substeps: int = 200
-    frequency_growth: float = 3.0
 
 
 class Dynamics:
@@ -116,41 +87,23 @@ class Dynamics:
         self._falls = any(gravity)
         self.loads = Loads(self.model, gravity) if loaded else None
         self.stepping = stepping or TimeStepping()
-        self._frame_time = 1.0 / self.stepping.rate
         self._integrator = Integrator(self.stepping.integrator, material.alpha, material.beta)
         size = 3 * mesh.node_count
         self._u, self._v = np.zeros(size), np.zeros(size)
-        self._inverse = np.repeat(np.where(mesh.fixed == 1, 0.0, 1.0 / self.model.mass), 3)
-        self._inertia = self.model.mass.copy()
-        self._frequency = FrequencyBound(self.model, self._inverse, self.stepping.frequency_growth)
-        growth, unscaled = self.stepping.frequency_growth, self._frequency.unscaled
-        if growth < 1.0:
-            self._inertia[:] = self._frequency.limit(np.arange(mesh.node_count), self._inverse)
-        self._uncut = self._frequency.omega
-        self._stiffened: StiffenedMass | None = None
-        if self.model.lawful:
-            self._stiffened = StiffenedMass(self.model, unscaled, self._inverse, growth)
-        self._bounds: dict[float, float] = {}
+        self.mass = NodalMass(self.model, self.stepping.frequency_growth)
+        implicit = self.stepping.integrator == 'implicit'
+        bounded = not self.model.rotating and not implicit
+        self.steps = TimeSteps(self.stepping, material, self.mass, bounded=bounded)
         self._still = 0
         self._elastic = ElasticState(self.model)
         self._touched: list[np.ndarray] = []
         self._loose: np.ndarray | None = np.zeros(0, np.int64)  # None: not known since a cut
-        self._caution = 1
-        self._cautious = 0
         self._detector = DivergenceDetector(mesh, material.youngs_modulus)
         active = active or ActiveSettings()
         self._far: FarField | None = None
         if active.mode == 'budget' and active.nodes < mesh.node_count:
             self._far = FarField(self.model, active.nodes)
-        self._active = self._far or ActiveRegion(
-            self.model, active, implicit=self.stepping.integrator == 'implicit'
-        )
-        if self.bound() == 0.0:
-            raise ValueError(
-                f'{self.stepping.integrator} has no stable step with damping alpha '
-                f'{material.alpha:g} 1/s and beta {material.beta:g} s: damp the tissue, or take '
-                'another integrator'
-            )
+        self._active = self._far or ActiveRegion(self.model, active, implicit=implicit)
 
     @property
     def displacement(self) -> np.ndarray:
@@ -166,17 +119,6 @@ class Dynamics:
     def positions(self) -> np.ndarray:
         """Current node positions [m], shape (n, 3); a new array."""
         return self.mesh.rest + self.displacement
-
-    @property
-    def omega(self) -> float:
-        """Bound of the highest frequency, for the step [rad/s]."""
-        bound = self._frequency.omega
-        return bound if self._stiffened is None else max(self._stiffened.omega, bound)
-
-    @property
-    def inverse_mass(self) -> np.ndarray:
-        """Inverse mass by coordinate, 0 where fixed [1/kg], shape (3 n,); a view."""
-        return self._inverse[: 3 * self.mesh.node_count]
 
     @property
     def concession(self) -> int:
@@ -225,30 +167,6 @@ class Dynamics:
         if self.loads is not None:
             self.resume(self.loads.at_rest(self.displacement.copy()))
 
-    def bound(self, couplings: Sequence[Coupling] = ()) -> float:
-        """Return the largest stable step [s], the stiffness of coupling springs included."""
-        square = self.omega**2
-        for coupling in couplings:
-            light = coupling.weights * self.inverse_mass[3 * coupling.nodes]
-            load = np.sum(light * coupling.weights)
-            if coupling.points is not None:  # each node by its weight alone (Gershgorin)
-                load = light.max()
-            square += coupling.stiffness * float(load)
-        # Rounded up, so that only few different bounds are computed.
-        omega = 1.01 ** np.ceil(np.log(np.sqrt(square)) / np.log(1.01))
-        if omega not in self._bounds:
-            m = self.material
-            self._bounds[omega] = step_bound(self.stepping.integrator, omega, m.alpha, m.beta)
-        return self._bounds[omega]
-
-    def _substeps(self, couplings: Sequence[Coupling]) -> tuple[int, float]:
-        dt = self.stepping.safety * self.bound(couplings) / self._caution
-        substeps = max(int(np.ceil(self._frame_time / dt)), self.stepping.min_substeps)
-        substeps = max(substeps, self._caution)
-        if substeps > self.stepping.max_substeps * self._caution:
-            return self.stepping.max_substeps * self._caution, dt
-        return substeps, self._frame_time / substeps
-
     @np.errstate(over='ignore', invalid='ignore')  # the numbers of a frame that diverges
     def advance(self, *couplings: Coupling, tools: Sequence[Tool] = ()) -> FrameMotion:
         """Integrate a frame; after divergence, retry it with shorter steps.
@@ -264,14 +182,10 @@ class Dynamics:
             self.loads.refresh(self._u[: 3 * self.mesh.node_count])
         if self._touched or len(self._elastic.force) != self.mesh.node_count:
             self._begin_account()  # a pass over the tissue, which must not slow down a batch
-        if self._cautious:
-            self._cautious -= 1
-            self._caution = self._caution if self._cautious else 1
-        if self._stiffened is not None:
-            flat = self._u[: 3 * self.mesh.node_count]
+        if self.mass.follows_strain:
             operands = self._far.operands() if self._far else self.model.operands()
-            self._stiffened.begin(flat, self._frequency.omega, self.inverse_mass, operands)
-        substeps, dt = self._substeps(couplings)
+            self.mass.begin(self._u[: 3 * self.mesh.node_count], operands)
+        substeps, dt = self.steps.begin(couplings)
         self._hold_back(_is_free(couplings, tools))
         before = (self._u.copy(), self._v.copy())
         met = self.cut_contact.kept()
@@ -279,7 +193,7 @@ class Dynamics:
         trouble = ''
         while True:
             work, contacts, taken = self._integrate(couplings, dt, substeps, tools)
-            slow = dt * substeps / self._frame_time
+            slow = dt * substeps / self.steps.frame_time
             motion = self._motion(slow, taken, trouble, contacts)
             energy = motion.kinetic_energy + motion.elastic_energy
             # Cut faces that begin in one another are moved apart: energy of no unstable step.
@@ -296,15 +210,12 @@ class Dynamics:
             trouble = trouble or f'{found}: {self._cause(couplings, dt)}'
             self._u, self._v = before[0].copy(), before[1].copy()
             self._turn_back()
-            known = not self.model.rotating and self.stepping.integrator != 'implicit'
-            if self._caution * _FINER > (_FINER if known else _FINEST):
+            finer = self.steps.refine()
+            if not finer:
                 break
             self._touched.append(np.arange(self.mesh.node_count))
-            self._caution *= _FINER
-            self._cautious = _CAUTIOUS_FRAMES
-            substeps, dt = substeps * _FINER, dt / _FINER
+            substeps, dt = substeps * finer, dt / finer
         self._v[:] = 0.0
-        self._caution = 1
         force, elastic = self._elastic.whole(self.displacement)
         self._detector.open(elastic + self._load_energy())
         return FrameMotion(np.zeros_like(force), 0.0, 0.0, substeps, 0.0, trouble, diverged=True)
@@ -317,7 +228,7 @@ class Dynamics:
             held = self.mesh.fixed.any()
             self._loose = np.flatnonzero(free_parts(self.mesh)) if held else np.zeros(0, np.int64)
         if self._loose is not None and len(self._loose):
-            self.velocity[self._loose] *= np.exp(-_DRAG * self._frame_time)
+            self.velocity[self._loose] *= np.exp(-_DRAG * self.steps.frame_time)
 
     def _hold_lost(self, u: np.ndarray, v: np.ndarray) -> bool:
         """Return to the start of the frame, with lost pieces held in their shapes at rest.
@@ -337,7 +248,7 @@ class Dynamics:
         for own in (np.flatnonzero(piece == p) for p in np.unique(piece[lost])):
             shape[own] = shape[own].mean(axis=0)  # else it would stay strained for ever
         v[: 3 * n].reshape(-1, 3)[lost] = 0.0
-        self.inverse_mass.reshape(-1, 3)[lost] = 0.0
+        self.mass.hold(lost)
         self._u, self._v = u.copy(), v.copy()
         self._turn_back()
         self._touched.append(np.arange(n))
@@ -359,33 +270,22 @@ class Dynamics:
         u, v = self._state()
         if isinstance(self._active, FarField):
             if _is_free(couplings):
-                self._active.relax(u, self._elastic.force, self.inverse_mass, self.omega)
+                self._active.relax(u, self._elastic.force, self.mass.inverse, self.mass.omega)
                 self._elastic.whole(self.displacement)
             force = self._elastic.force
-            return self._active.choose(u, v, force, self.inverse_mass, couplings, self.omega)
+            return self._active.choose(u, v, force, self.mass.inverse, couplings, self.mass.omega)
         b = self.material.beta
         some = len(contacts.nodes) and not self._active.whole
         pressed = self.cut_contact.force(contacts, u, v) if some else None
-        at = u, v, b, self.inverse_mass
+        at = u, v, b, self.mass.inverse
         met = contacts.nodes.ravel(), pressed
-        return self._active.choose(*at, held_nodes(couplings), self._frame_time, met)
-
-    def _finer(self, couplings: Sequence[Coupling], dt: float) -> int:
-        """Return into how many parts a step must be split for a spring that is new in the frame.
-
-        A blade that enters holds fewer nodes than the tool did when the step was chosen: where they
-        are light, the frequency of the spring is above that of the tissue.
-        """
-        bound = self.bound(couplings)
-        if dt <= bound or bound == 0.0:
-            return 1
-        return min(int(np.ceil(dt / (self.stepping.safety * bound))), _FINEST)
+        return self._active.choose(*at, held_nodes(couplings), self.steps.frame_time, met)
 
     def _integrate(
         self, couplings: Sequence[Coupling], dt: float, substeps: int, tools: Sequence[Tool]
     ) -> tuple[float, NearFaces, int]:
-        """Move the tissue by a frame; return the work of the tools [J], what is in contact, and the
-        number of substeps.
+        """Move the tissue by a frame; return the work of the tools [J], the cut faces in contact,
+        and the number of substeps.
         """
         size = 3 * self.mesh.node_count
         moving = self._state()[1][:size]
@@ -420,13 +320,12 @@ class Dynamics:
             if faces is None:
                 contacts = near.among(self._active.move(near.nodes))
                 faces = self._meeting(contacts, region)
-            steps = self._active.ahead(substeps - done, substeps, self.omega / self._uncut)
-            if self._stiffened is not None:
+            steps = self._active.ahead(substeps - done, substeps, self.mass.omega / self.mass.uncut)
+            if self.mass.follows_strain:
                 if done >= adapt:
                     operands = region.operands if self._far else self.model.operands()
                     begun = done == 0 and self._far is None
-                    given = self._u[:size], moving, self.inverse_mass, operands
-                    self._stiffened.adapt(*given, begun=begun)
+                    self.mass.adapt(self._u[:size], moving, operands, begun=begun)
                     adapt = done + SUBSTEPS_BETWEEN
                 steps = min(steps, adapt - done)
             if self.loads is not None:
@@ -444,7 +343,7 @@ class Dynamics:
                 positions = self.positions
                 couplings = [tool.after(done / substeps, positions) for tool in tools]
                 springs = springs_of(couplings, self.mesh.rest)
-                finer = self._finer(couplings, dt)
+                finer = self.steps.parts(couplings, dt)
                 if finer > 1:
                     done, substeps, dt = finer * done, finer * substeps, dt / finer
                     look, adapt = finer * look, finer * adapt
@@ -484,7 +383,7 @@ class Dynamics:
         place = region.place
         at = slice(None) if place is None else place.at
         u, v = (values[at] for values in self._state())
-        inverse, diagonal = self._present_inverse(), self.model.diagonal
+        inverse, diagonal = self.mass.present_inverse, self.model.diagonal
         if self._far is not None:
             inverse = self._far.inverse(inverse)
             if self.stepping.integrator == 'implicit':
@@ -513,23 +412,18 @@ class Dynamics:
             self._u[place.at[:own]], self._v[place.at[:own]] = u[:own], v[:own]
         return work
 
-    def _present_inverse(self) -> np.ndarray:
-        """Return the inverse masses [1/kg], with those of stiffened nodes, shape (3 n,)."""
-        stiffened, base = self._stiffened, self.inverse_mass
-        return base if stiffened is None else stiffened.inverse(base)
-
     def _motion(self, slow: float, substeps: int, trouble: str, contacts: NearFaces) -> FrameMotion:
         force, elastic = self._elastic_now()
         if len(contacts.nodes):
             force = force - self.cut_contact.force(contacts, *self._state())
         elastic += self._load_energy()
         kinetic = self._kinetic_energy()
-        strain = None if self._stiffened is None else self._stiffened.strain
+        strain = self.mass.strain
         return FrameMotion(force, kinetic, elastic, substeps, slow, trouble, strain=strain)
 
     def _cause(self, couplings: Sequence[Coupling], dt: float) -> str:
-        name, bound = self.stepping.integrator, self.bound(couplings)
-        limit = f'the {1e3 * bound:.3g} ms at which {name} is stable at {self.omega:.4g} rad/s'
+        name, bound = self.stepping.integrator, self.steps.bound(couplings)
+        limit = f'the {1e3 * bound:.3g} ms at which {name} is stable at {self.mass.omega:.4g} rad/s'
         if dt > bound:
             return f'a step of {1e3 * dt:.3g} ms is above {limit}'
         inverted = self.inverted
@@ -566,7 +460,8 @@ class Dynamics:
         self.model.update(touched)
         if self.loads is not None:
             self.loads.apply_cut(n, delta, touched)
-        self._follow_cut(touched.nodes)
+        self.mass.follow_cut(touched.nodes)
+        self._touched.append(touched.nodes)
         self._active.follow_cut(touched)
         velocity = self._state()[1][3 * self.mesh.node_count :]
         velocity[:] = grown(unknowns, len(velocity))[: len(velocity)]
@@ -618,24 +513,8 @@ class Dynamics:
         return self.loads.energy(self._u[: 3 * self.mesh.node_count])
 
     def _kinetic_energy(self) -> float:
-        v, inertia = self.velocity, self._inertia[: self.mesh.node_count]
-        if self._stiffened is not None:
-            inertia = 1.0 / np.maximum(self._present_inverse()[::3], 1e-300)
-            inertia = np.where(self.inverse_mass[::3] > 0.0, inertia, 0.0)
-        if not self._active.whole:  # the others are at rest
-            v, inertia = v[self._active.nodes], inertia[self._active.nodes]
-        return 0.5 * float((inertia * np.square(v).sum(axis=1)).sum())
-
-    def _follow_cut(self, nodes: np.ndarray) -> None:
-        """Update nodal data where a cut touched it, nodes of shape (r,)."""
-        n = self.mesh.node_count
-        if len(self._inertia) < n:
-            self._inertia = grown(self._inertia, n)
-            self._inverse = grown(self._inverse, 3 * len(self._inertia))
-        self._inertia[nodes] = self._frequency.limit(nodes, self.inverse_mass)
-        if self._stiffened is not None:
-            self._stiffened.follow_cut()
-        self._touched.append(nodes)
+        moving = None if self._active.whole else self._active.nodes  # the others are at rest
+        return self.mass.kinetic_energy(self.velocity, moving)
 
 
 def _is_free(couplings: Sequence[Coupling], tools: Sequence[Tool] = ()) -> bool:

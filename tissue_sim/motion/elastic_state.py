@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, internal_force
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
 
 

@@ -13,7 +13,7 @@ from cutting_trainer.tissue_sim.contact.coupling import (
     work_of_springs,
 )
 from cutting_trainer.tissue_sim.contact.cut_contact import meet, subtract_pulls
-from cutting_trainer.tissue_sim.elasticity.models import internal_force
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
 
 # Slices begin at 0: a possibly negative index would prevent vectorisation.
 

@@ -17,7 +17,8 @@ from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.contact.coupling import FREE, Coupling, held_nodes
 from cutting_trainer.tissue_sim.elasticity.coarse_rows import CoarseRows
 from cutting_trainer.tissue_sim.elasticity.corotational import KEPT
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, internal_force
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands, internal_force
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import smoothed_gradient
 from cutting_trainer.tissue_sim.elasticity.rotation import LANES
 from cutting_trainer.tissue_sim.mesh.adjacency import intervals

@@ -22,7 +22,7 @@ from cutting_trainer.tissue_sim.contact.coupling import (
     start_of_work,
     work_of_springs,
 )
-from cutting_trainer.tissue_sim.elasticity.models import internal_force, stiffness_product
+from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force, stiffness_product
 
 _SECANTS = 6
 

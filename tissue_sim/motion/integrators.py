@@ -6,7 +6,7 @@ import numpy as np
 
 from cutting_trainer.tissue_sim.contact.coupling import Springs
 from cutting_trainer.tissue_sim.contact.cut_contact import NO_CUT_CONTACTS, CutContacts
-from cutting_trainer.tissue_sim.elasticity.models import Operands
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands
 from cutting_trainer.tissue_sim.motion.explicit import euler_steps, rk4_steps
 from cutting_trainer.tissue_sim.motion.implicit import implicit_steps
 

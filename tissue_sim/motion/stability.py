@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, stiffness_product
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands, stiffness_product
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.adjacency import spans_of
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import grown
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName

@@ -9,7 +9,8 @@ import numpy as np
 
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.elasticity.adaptive_law import add_tangent_traces, linear_traces
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.elasticity.stiffening import MAX_EXPONENT, MIN_RATIO
 from cutting_trainer.tissue_sim.mesh.strain import Strain
 from cutting_trainer.tissue_sim.motion.stability import highest_square

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static, solve_within
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands, internal_force
 from cutting_trainer.tissue_sim.elasticity.material import Material
-from cutting_trainer.tissue_sim.elasticity.models import ElasticModel, Operands, internal_force
+from cutting_trainer.tissue_sim.elasticity.models import ElasticModel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.far_field import FarField
 from cutting_trainer.tissue_sim.motion.stability import FrequencyBound

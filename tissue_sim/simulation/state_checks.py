@@ -13,8 +13,8 @@ from cutting_trainer.tissue_sim.contact.friction import GrippingSprings
 from cutting_trainer.tissue_sim.contact.immersion import POINTS
 from cutting_trainer.tissue_sim.elasticity.adaptive_law import Law
 from cutting_trainer.tissue_sim.elasticity.corotational import KEPT, Elements
+from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands
 from cutting_trainer.tissue_sim.elasticity.local_rows import Locality
-from cutting_trainer.tissue_sim.elasticity.models import Operands
 from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import NodalSmoothing, SmoothingDomains
 from cutting_trainer.tissue_sim.elasticity.rotation import LANES
 from cutting_trainer.tissue_sim.elasticity.viscosity import KEPT as KEPT_OF_TERM
@@ -131,22 +131,23 @@ def check_simulation(simulation: TissueSimulation) -> None:
     model = dynamics.model
     n = mesh.node_count
     check_mesh(mesh)
-    meshes = (dynamics.mesh, model.mesh)
+    meshes = (dynamics.mesh, model.mesh, dynamics.mass._model.mesh)
     parts: list[Any] = [model.tensor_mass, model._domains, model._elements, model._neighbours]
     inner = tuple(part._mesh for part in parts if part is not None)
     if any(other is not mesh for other in meshes + inner):
         raise StateError('its parts are of different meshes')
-    for name in ('_u', '_v', '_inverse'):
+    for name in ('_u', '_v'):
         has_room(name, getattr(dynamics, name), 3 * n)
-    has_room('_inertia', dynamics._inertia, n)
+    has_room('_inverse', dynamics.mass._inverse, 3 * n)
+    has_room('_inertia', dynamics.mass._inertia, n)
     has_room('_pull', dynamics.cut_contact._pull, 0, 3)
     if dynamics.cut_contact._mesh is not mesh:
         raise StateError('the cut faces are of another tissue')
     if dynamics._loose is not None:
         within('_loose', dynamics._loose, n)
     _check_loads(dynamics, n)
-    if dynamics._stiffened is not None:
-        has_room('_linear', dynamics._stiffened._linear, n)
+    if dynamics.mass._stiffened is not None:
+        has_room('_linear', dynamics.mass._stiffened._linear, n)
     regions = len(model.material.relative_stiffness)
     within('region', mesh.regions, regions)
     for tool in simulation.tools:
@@ -281,7 +282,7 @@ def _check_law_operands(operands: Operands) -> None:
 def _check_estimates(simulation: TissueSimulation, n: int) -> None:
     """Check the estimates of frequency and compliance, and the integrator."""
     dynamics = simulation.dynamics
-    has_room('_f', dynamics._frequency._f, 0)
+    has_room('_f', dynamics.mass._frequency._f, 0)
     work: Any = dynamics._integrator._work
     has_room('_work', work, 7, *work.shape[1:])
     has_room('_damping', dynamics._integrator._damping, 2)
