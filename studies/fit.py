@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 DIFFERENCE = 0.2
 """Step of the central differences of logarithms: a cut goes on from element to element, and a
-smaller step divides its jumps by less. Slopes are taken again where the search is further away."""
+smaller step divides its jumps by less."""
 START_POINTS = 3
 """Points of the start's design for each unknown."""
 MAX_STEPS = 8
@@ -30,8 +30,11 @@ _START_BAGS = 3
 _START_SPREAD = 1.5
 """Half of the design's range, and _BOUND that of the search, in spreads of the prior."""
 _BOUND = 3.0
+_NEAR = DIFFERENCE / 2
+"""Distance from which slopes are taken again, and a further step is worth a search."""
 _TOLERANCE = 3e-3
-"""Of a search, in shares of the logarithms: 3 % of a constant. A Gauss-Newton step follows."""
+"""A search ends where a step is below this share of the logarithms, which is 3 % of a constant, or
+where it gains less than this share of the loss. A Gauss-Newton step follows."""
 _FAILED = 10.0
 """Residual of a point that cannot be computed, in recorded forces."""
 _SEED = 0
@@ -57,7 +60,8 @@ Point = tuple[float, ...]
 Compute = Callable[[Iterable[tuple[int, Point]]], dict[tuple[int, Point], Floats]]
 """Returns computed forces [N], shape (n, 3), by number of bag and point; NaN where it failed."""
 Slopes = dict[tuple[int, int], Floats]
-"""Change of forces with a logarithm [N], shape (n, 3), by number of bag and of the unknown."""
+"""Change of the window means with a logarithm [N], shape (windows, 3), by number of bag and of the
+unknown."""
 
 
 class Fit:
@@ -68,7 +72,10 @@ class Fit:
         priors: of the unknowns, by name.
         noise: of the force for one sample of one component [N].
         compute: re-simulates.
-        coarser: of the same bags on a coarser mesh, whose slopes serve where this one has none yet.
+        lead: slopes on another mesh by their place, which serve until this fit has some.
+
+    Attributes:
+        slopes: taken so far, by the logarithms of the constants, shape (p,).
     """
 
     def __init__(
@@ -77,10 +84,10 @@ class Fit:
         priors: dict[str, Prior],
         noise: float,
         compute: Compute,
-        coarser: 'Fit | None' = None,
+        lead: Sequence[tuple[Floats, Slopes]] = (),
     ) -> None:
         self._observations, self._priors, self._compute = observations, priors, compute
-        self._coarser = coarser
+        self._lead = lead
         self._without_jumps = [deviations(o.times, o.felt, noise) for o in observations]
         self._deviations = list(self._without_jumps)
         self._felt = [window_means(o.times, o.felt) for o in observations]
@@ -88,7 +95,7 @@ class Fit:
         self._spread = np.array([prior.spread for prior in priors.values()])
         self._known: dict[tuple[int, Point], Floats] = {}
         self._untouched: set[tuple[int, int]] = set()
-        self._slopes: list[tuple[Floats, Slopes]] = []
+        self.slopes: list[tuple[Floats, Slopes]] = []
         self._scale = 1.0
 
     def solve(self, begin: Floats, confidence: float) -> Linearised:
@@ -107,9 +114,10 @@ class Fit:
         for _ in range(MAX_SEARCHES):
             at = self._search(at, low, high)
             better = self._better_end(at, low, high)
-            if better is None:
+            if better is not None:
+                at = better
+            elif self._rest(at) <= _NEAR:
                 break
-            at = better
         self._slopes_at(at)
         self._allow_for_jumps(at)
         return Linearised(
@@ -204,45 +212,52 @@ class Fit:
 
     def _jacobians(self, at: Floats) -> list[Floats]:
         """Return slopes of the weighted window means near a point, each of shape (3 windows, p)."""
-        _, slopes = self._slopes_near(at)
-        unknowns = range(len(at))
+        slopes, unknowns = self._slopes_near(at), range(len(at))
         return [
-            np.column_stack([
-                self._weighted(bag, slopes[bag, i]) if (bag, i) in slopes else np.zeros(felt.size)
-                for i in unknowns
-            ])
-            for bag, felt in enumerate(self._felt)
-        ]  # fmt: skip
+            np.column_stack([self._divided(bag, slopes[bag, i]) for i in unknowns])
+            for bag in range(len(self._observations))
+        ]
 
-    def _slopes_near(self, at: Floats) -> tuple[Floats, Slopes]:
-        """Return the nearest slopes within a step of the differences, and where they were taken."""
-        known = self._slopes or (self._coarser._slopes if self._coarser else [])
+    def _slopes_near(self, at: Floats) -> Slopes:
+        """Return the slopes that are nearest to a point; take some there if none are near."""
+        known = self.slopes or self._lead
         away = [float(np.abs(at - centre).max()) for centre, _ in known]
-        if away and min(away) <= DIFFERENCE:
-            return known[int(np.argmin(away))]
-        return at, self._slopes_at(at)
+        if away and min(away) < _NEAR:
+            return known[int(np.argmin(away))][1]
+        return self._slopes_at(at)
 
     def _slopes_at(self, at: Floats) -> Slopes:
-        """Take the slopes of the forces at a point."""
-        bags, unknowns, ends = range(len(self._observations)), range(len(at)), self._ends(at)
-        touched = [(bag, i) for bag in bags for i in unknowns if (bag, i) not in self._untouched]
-        self._need([(bag, point) for bag, i in touched for point in ends[i]])
-        self.forces(at)
-        slopes = {}
-        for bag, i in touched:
+        """Take the slopes at a point, and keep them unless one is of an end that failed."""
+        pairs = [(b, i) for b in range(len(self._observations)) for i in range(len(at))]
+        ends, middle = self._ends(at), self.forces(at)
+        self._need([(bag, ends[i][1]) for bag, i in pairs])
+        for bag, i in self._untouched:  # a weaker tissue is cut first
+            if np.array_equal(self._known[bag, ends[i][1]], middle[bag]):
+                self._known.setdefault((bag, ends[i][0]), middle[bag])
+        self._need([(bag, ends[i][0]) for bag, i in pairs])
+        slopes, complete = {}, True
+        for bag, i in pairs:
             up, down = (self._known[bag, point] for point in ends[i])
-            between = self._known[bag, self._point(at)]
             failed = [bool(np.isnan(end).any()) for end in (up, down)]
             width = 2.0 * DIFFERENCE if not any(failed) else DIFFERENCE
-            up, down = (between if failed[0] else up), (between if failed[1] else down)
-            slopes[bag, i] = (up - down) / width
-            if not any(failed) and np.array_equal(up, down):
-                self._untouched.add((bag, i))  # as the toughness where a hand does not cut
-        for bag, i in self._untouched:
-            middle = self._known[bag, self._point(at)]
-            self._known = dict.fromkeys([(bag, point) for point in ends[i]], middle) | self._known
-        self._slopes.append((at, slopes))
+            up, down = (middle[bag] if failed[0] else up), (middle[bag] if failed[1] else down)
+            slopes[bag, i] = window_means(self._observations[bag].times, (up - down) / width)
+            if any(failed):
+                complete = False
+            elif np.array_equal(up, down):
+                self._untouched.add((bag, i))
+            else:
+                self._untouched.discard((bag, i))
+        if complete and not any(np.array_equal(at, centre) for centre, _ in self.slopes):
+            self.slopes.append((at, slopes))
         return slopes
+
+    def _rest(self, at: Floats) -> float:
+        """Return the largest change of a logarithm in the step that is left at a point."""
+        slope, residuals = self._slope(at), self._objective(at)
+        weighted = slope / np.hypot(1.0, residuals)[:, None]
+        step = np.linalg.lstsq(weighted.T @ slope, weighted.T @ residuals, rcond=None)[0]
+        return float(np.abs(step).max())
 
     def _ends(self, at: Floats) -> list[tuple[Point, Point]]:
         """Return the ends of the central difference along each unknown."""
@@ -270,7 +285,9 @@ class Fit:
 
     def _weighted(self, bag: int, forces: Floats) -> Floats:
         """Return window means over their deviations, shape (3 windows,); 0 where none is known."""
-        means = window_means(self._observations[bag].times, forces)
+        return self._divided(bag, window_means(self._observations[bag].times, forces))
+
+    def _divided(self, bag: int, means: Floats) -> Floats:
         return np.nan_to_num(means / self._deviations[bag], nan=0.0).ravel()
 
     def _point(self, at: Floats) -> Point:

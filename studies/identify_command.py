@@ -188,7 +188,7 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
             for bag in bags
         ]
         again = partial(running.compute, meshes=refined)
-        fit = Fit(observations, priors, options.noise, again, coarser=fit)
+        fit = Fit(observations, priors, options.noise, again, fit.slopes)
         problem = fit.solve(coarse, CONFIDENCE)
         problem = replace(problem, mesh_change=problem.estimates - coarse)
     return Identification(

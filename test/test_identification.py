@@ -106,6 +106,18 @@ def test_a_search_that_stops_where_a_step_away_the_fit_is_better_begins_anew(mon
     assert len(begins) == 2 and begins[1][0] == pytest.approx(5000.0 * np.exp(fit.DIFFERENCE))
 
 
+def test_a_constant_that_no_bag_touches_at_the_start_is_looked_at_again() -> None:
+    def entering(wanted: Iterable[tuple[int, tuple[float, ...]]]) -> dict:
+        return {
+            (bag, point): law(bag, *point) * [float(point[1] < 200.0), 1.0, 1.0]
+            for bag, point in wanted
+        }
+
+    observed = [Observation(TIMES, law(bag, *TRUTH.values())) for bag in range(3)]
+    found = Fit(observed, PRIORS, NOISE, entering).solve(np.log([6500.0, 400.0]), 0.95)
+    assert np.exp(found.estimates) == pytest.approx(list(TRUTH.values()), rel=0.02)
+
+
 def test_slopes_of_the_coarser_mesh_lead_to_the_solution_of_the_finer_one() -> None:
     asked = []
 
@@ -118,8 +130,9 @@ def test_slopes_of_the_coarser_mesh_lead_to_the_solution_of_the_finer_one() -> N
     begin = coarse.solve(np.log([5000.0, 200.0]), 0.95).estimates
     alone = Fit(observed, PRIORS, NOISE, softer).solve(begin, 0.95)
     sessions = len(asked)
-    led = Fit(observed, PRIORS, NOISE, softer, coarse).solve(begin, 0.95)
+    led = Fit(observed, PRIORS, NOISE, softer, coarse.slopes).solve(begin, 0.95)
     assert led.estimates == pytest.approx(alone.estimates, abs=2e-3)
+    assert led.half_widths == pytest.approx(alone.half_widths, rel=0.02)  # by its own slopes
     assert len(asked) - sessions < sessions
 
 
