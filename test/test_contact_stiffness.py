@@ -72,7 +72,7 @@ def stiffness_at(dynamics: Dynamics, place: np.ndarray) -> float:
     nodes, weights = touched(dynamics.mesh, place)
     load = np.zeros_like(dynamics.mesh.rest)
     load[nodes, 2] = weights
-    moved = solve_static(dynamics.model, dynamics.mass.inverse > 0, load)
+    moved = solve_static(dynamics.model, dynamics.masses.inverse > 0, load)
     return 1 / (1 / SPRING + weights @ moved[nodes, 2])
 
 
@@ -172,7 +172,7 @@ def pressed_by(dynamics: Dynamics, depth: float) -> float:
     spring = springs(dynamics, 'footprint').spring(contact(dynamics.mesh, -depth), 0.0, depth)
     load = np.zeros_like(dynamics.mesh.rest)
     load[spring.nodes, 2] = spring.weights
-    moved = solve_static(dynamics.model, dynamics.mass.inverse > 0, load)
+    moved = solve_static(dynamics.model, dynamics.masses.inverse > 0, load)
     soft = spring.weights @ moved[spring.nodes, 2]
     return replace(spring, stiffness=1 / (1 / SPRING + soft)).pushed(depth)
 

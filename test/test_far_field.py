@@ -183,7 +183,7 @@ def test_a_region_that_goes_on_makes_no_jump_and_a_body_at_rest_stays_at_rest(
     dynamics = Dynamics(
         mesh, TISSUE, model, TimeStepping('symplectic_euler'), ActiveSettings('budget', NODES)
     )
-    free = dynamics.mass.inverse > 0
+    free = dynamics.masses.inverse > 0
     elastic = ElasticModel(slab(), TISSUE, 'linear_smoothed')
     dynamics.resume(solve_static(elastic, free, load))
     dynamics.model.load = load.ravel()

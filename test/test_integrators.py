@@ -149,8 +149,8 @@ def test_ten_thousand_steps_just_below_the_limit_decay_and_just_above_it_grow(
 def test_the_frequency_bound_lies_above_the_highest_frequency_and_not_far(name: ModelName) -> None:
     mesh, material = small_block()
     dynamics = Dynamics(mesh, material, name)
-    true = highest(dynamics.model, dynamics.mass.inverse)
-    assert true < dynamics.mass.omega < 1.05 * true
+    true = highest(dynamics.model, dynamics.masses.inverse)
+    assert true < dynamics.masses.omega < 1.05 * true
 
 
 def held(integrator: IntegratorName, name: ModelName, mode: int) -> tuple[Dynamics, Coupling]:

@@ -193,9 +193,9 @@ def test_after_a_cut_through_elements_the_bound_holds_and_the_lips_come_to_rest(
     """Cut at the true crossings: the method that makes slivers."""
     tissue = cut_block(name, integrator, 'subdivide')
     dynamics = tissue.dynamics
-    root = np.sqrt(dynamics.mass.inverse)
+    root = np.sqrt(dynamics.masses.inverse)
     true = np.sqrt(np.linalg.eigvalsh(root[:, None] * dynamics.model.dense() * root)[-1])
-    assert true < dynamics.mass.omega
+    assert true < dynamics.masses.omega
     rng = np.random.default_rng(0)
     free = tissue.mesh.fixed == 0
     tissue.displacement[free] += 2e-5 * rng.normal(size=(int(free.sum()), 3))
@@ -312,7 +312,7 @@ class _Entering:
 def test_the_step_follows_a_spring_that_is_new_within_a_frame() -> None:
     tissue = simulation(integrator='symplectic_euler').dynamics
     node = int(np.flatnonzero(tissue.mesh.fixed == 0)[0])
-    stiffness = 3.0 * tissue.mass.omega**2 * float(tissue.model.mass[node])
+    stiffness = 3.0 * tissue.masses.omega**2 * float(tissue.model.mass[node])
     place = tissue.mesh.rest[node] + [0.0, 0.0, 1e-5]
     calm = tissue.advance(Coupling())
     motion = tissue.advance(Coupling(), tools=[_Entering(node, place, stiffness)])

@@ -80,7 +80,7 @@ def dynamics_of(block: Block, name: ModelName, stepping: TimeStepping) -> Dynami
 def highest(block: Block, name: ModelName) -> float:
     """The highest frequency [rad/s], small nodes with the mass that they got by the cut."""
     dynamics = dynamics_of(block, name, TimeStepping('rk4'))
-    root = np.sqrt(dynamics.mass.inverse)
+    root = np.sqrt(dynamics.masses.inverse)
     stiffness = root[:, None] * dynamics.model.dense() * root
     return float(np.sqrt(np.linalg.eigvalsh(stiffness)[-1]))
 

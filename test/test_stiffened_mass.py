@@ -65,10 +65,10 @@ def highest_frequency(dynamics: Dynamics, flat: np.ndarray, inverse: np.ndarray)
 
 def adapted(dynamics: Dynamics, flat: np.ndarray) -> tuple[float, np.ndarray]:
     """Frequency of the step [rad/s], and inverse masses, of a displacement."""
-    stiffened, whole = dynamics.mass._stiffened, dynamics.model.operands()
+    stiffened, whole = dynamics.masses._stiffened, dynamics.model.operands()
     assert stiffened is not None
-    stiffened.begin(flat, dynamics.mass._frequency.omega, dynamics.mass.inverse, whole)
-    inverse = stiffened.adapt(flat, np.zeros_like(flat), dynamics.mass.inverse, whole)
+    stiffened.begin(flat, dynamics.masses._frequency.omega, dynamics.masses.inverse, whole)
+    inverse = stiffened.adapt(flat, np.zeros_like(flat), dynamics.masses.inverse, whole)
     return stiffened.omega, inverse
 
 
@@ -79,9 +79,9 @@ def test_no_tangent_is_faster_than_the_step_allows(kind: str, nu: float, stiffen
     flat = shape(dynamics.mesh.rest, kind).ravel()
     omega, inverse = adapted(dynamics, flat)
     assert (
-        highest_frequency(dynamics, flat, inverse) < omega <= 2 * dynamics.mass.uncut * (1 + 1e-9)
+        highest_frequency(dynamics, flat, inverse) < omega <= 2 * dynamics.masses.uncut * (1 + 1e-9)
     )
-    assert highest_frequency(dynamics, flat, dynamics.mass.inverse) > 1.2 * dynamics.mass.uncut
+    assert highest_frequency(dynamics, flat, dynamics.masses.inverse) > 1.2 * dynamics.masses.uncut
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -128,21 +128,21 @@ def test_frequency_growth_limits_the_substeps_of_a_strained_tissue_too() -> None
 
 def test_a_node_that_becomes_heavier_keeps_its_momentum_and_a_lighter_one_its_velocity() -> None:
     dynamics = tissue(0.3, 12.0)
-    stiffened, n = dynamics.mass._stiffened, dynamics.mesh.node_count
+    stiffened, n = dynamics.masses._stiffened, dynamics.mesh.node_count
     assert stiffened is not None
     strained = shape(dynamics.mesh.rest, 'pressed').ravel()
     v = np.repeat(np.where(dynamics.mesh.fixed == 1, 0.0, 0.1), 3)
     whole = dynamics.model.operands()
-    stiffened.begin(strained, dynamics.mass._frequency.omega, dynamics.mass.inverse, whole)
-    rest = stiffened.adapt(np.zeros(3 * n), v, dynamics.mass.inverse, whole).copy()
-    np.testing.assert_array_equal(rest, dynamics.mass.inverse)
+    stiffened.begin(strained, dynamics.masses._frequency.omega, dynamics.masses.inverse, whole)
+    rest = stiffened.adapt(np.zeros(3 * n), v, dynamics.masses.inverse, whole).copy()
+    np.testing.assert_array_equal(rest, dynamics.masses.inverse)
     before = v.copy()
-    heavy = stiffened.adapt(strained, v, dynamics.mass.inverse, whole)
+    heavy = stiffened.adapt(strained, v, dynamics.masses.inverse, whole)
     assert stiffened.strain.heavier > 0 and stiffened.strain.added > 0
     free = rest > 0
     np.testing.assert_allclose(v[free] / heavy[free], before[free] / rest[free], rtol=1e-12)
     slow = v.copy()
-    stiffened.adapt(np.zeros(3 * n), v, dynamics.mass.inverse, whole)
+    stiffened.adapt(np.zeros(3 * n), v, dynamics.masses.inverse, whole)
     np.testing.assert_array_equal(v, slow)
     assert stiffened.strain.heavier == 0
 

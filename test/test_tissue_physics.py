@@ -98,9 +98,9 @@ def test_no_mode_is_faster_than_the_bound_at_any_time_of_a_cut(
         for a, b in pairwise(straight(*ends, (0.0, 0.001, 0.02), 6)):
             cut = method.advance(tissue.mesh, tissue.mesh.rest, Sweep(*a, *b))
             tissue.apply_cut(cut.delta)
-            highest = highest_frequency(tissue.model, tissue.mass.inverse)
-            ratios.append(highest / tissue.mass._frequency.omega)
-        assert tissue.mass._frequency.omega <= 1.01 * growth * tissue.mass._frequency.unscaled
+            highest = highest_frequency(tissue.model, tissue.masses.inverse)
+            ratios.append(highest / tissue.masses._frequency.omega)
+        assert tissue.masses._frequency.omega <= 1.01 * growth * tissue.masses._frequency.unscaled
     assert max(ratios) < 1.0
 
 

@@ -80,7 +80,7 @@ def test_a_sheared_block_relaxes_as_the_series_says(
 
 def rollers(dynamics: Dynamics) -> None:
     """Let each plane through the origin slide in itself, and hold nothing else."""
-    rest, inverse = dynamics.mesh.rest, dynamics.mass.inverse.reshape(-1, 3)
+    rest, inverse = dynamics.mesh.rest, dynamics.masses.inverse.reshape(-1, 3)
     inverse[:] = 1.0 / dynamics.model.mass[:, None]
     inverse[rest < 1e-9] = 0.0
 
@@ -94,7 +94,7 @@ def test_a_stretched_block_relaxes_as_the_series_says(
     rollers(dynamics)
     rest, strain = dynamics.mesh.rest, 0.005
     top = rest[:, 2] > SIDE - 1e-9
-    dynamics.mass.inverse.reshape(-1, 3)[top, 2] = 0.0
+    dynamics.masses.inverse.reshape(-1, 3)[top, 2] = 0.0
     dynamics.displacement[:] = rest * np.array([-NU, -NU, 1.0]) * strain
     dynamics.restart()
     times, forces = np.arange(1, 16) / 30, []
@@ -119,7 +119,7 @@ def test_a_block_that_is_loaded_creeps_as_the_series_says(integrator: Integrator
         found.append(dynamics.displacement[top, 2].mean())
     times = np.arange(1, 31) / 30
     load = (dynamics.model.mass[:, None] * pull).reshape(-1, 3)
-    first = solve_static(dynamics.model, dynamics.mass.inverse > 0, load)[top, 2].mean()
+    first = solve_static(dynamics.model, dynamics.masses.inverse > 0, load)[top, 2].mean()
     assert first == pytest.approx(density * pull[2] * SIDE**2 / (2 * E), rel=0.04)
     exact = first * uniaxial_creep(dynamics.material, times)
     # First comes a damped fall.

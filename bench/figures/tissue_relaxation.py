@@ -88,11 +88,13 @@ def pulled(
     material = Material(*MODULI, 10.0, 200.0, 1e-4, 0.0, series)
     stepping = TimeStepping(integrator, max_substeps=5000)
     dynamics = Dynamics(mesh, material, name, stepping, gravity=(0.0, 0.0, PULL))
-    dynamics.mass.inverse.reshape(-1, 3)[mesh.rest < 1e-9] = 0.0  # planes that slide in themselves
+    dynamics.masses.inverse.reshape(-1, 3)[mesh.rest < 1e-9] = (
+        0.0  # planes that slide in themselves
+    )
     top = mesh.rest[:, 2] > SIDE - 1e-9
     weight = np.zeros_like(mesh.rest)
     weight[:, 2] = PULL * dynamics.model.mass
-    first = solve_static(dynamics.model, dynamics.mass.inverse > 0, weight)[top, 2].mean()
+    first = solve_static(dynamics.model, dynamics.masses.inverse > 0, weight)[top, 2].mean()
     return dynamics, lambda: float(dynamics.displacement[top, 2].mean() / first)
 
 

@@ -121,8 +121,8 @@ def _tissue(mesh: TetMesh, active: ActiveSettings) -> TissueSimulation:
 
 def _step(simulation: TissueSimulation) -> float:
     dynamics, count = simulation.dynamics, 8
-    dt = 0.8 * dynamics.steps.bound()
-    steps = steps_of(simulation.model, dynamics.mass.inverse, 'symplectic_euler', dt, count)
+    dt = 0.8 * dynamics.time_steps.bound()
+    steps = steps_of(simulation.model, dynamics.masses.inverse, 'symplectic_euler', dt, count)
     return 1e3 * float(np.median(by_turns(steps))) / count
 
 

@@ -224,9 +224,9 @@ class Session:
     def added_mass(self) -> float:
         """Added mass as a share of the tissue's own [-]."""
         dynamics = self.simulation.dynamics
-        free = dynamics.mass.inverse[::3] > 0
+        free = dynamics.masses.inverse[::3] > 0
         mass = dynamics.model.mass[free]
-        return float((1.0 / dynamics.mass.inverse[::3][free]).sum() / mass.sum() - 1.0)
+        return float((1.0 / dynamics.masses.inverse[::3][free]).sum() / mass.sum() - 1.0)
 
     @property
     def bytes(self) -> int:

@@ -64,6 +64,8 @@ class Dynamics:
 
     Attributes:
         cut_contact: of cut faces; with `implicit` they do not meet.
+        masses: of the nodes, with which they are integrated.
+        time_steps: of a frame.
 
     Raises:
         ValueError: the integrator has no stable step with this damping.
@@ -90,10 +92,10 @@ class Dynamics:
         self._integrator = Integrator(self.stepping.integrator, material.alpha, material.beta)
         size = 3 * mesh.node_count
         self._u, self._v = np.zeros(size), np.zeros(size)
-        self.mass = NodalMass(self.model, self.stepping.frequency_growth)
+        self.masses = NodalMass(self.model, self.stepping.frequency_growth)
         implicit = self.stepping.integrator == 'implicit'
         bounded = not self.model.rotating and not implicit
-        self.steps = TimeSteps(self.stepping, material, self.mass, bounded=bounded)
+        self.time_steps = TimeSteps(self.stepping, material, self.masses, bounded=bounded)
         self._still = 0
         self._elastic = ElasticState(self.model)
         self._touched: list[np.ndarray] = []
@@ -182,10 +184,10 @@ class Dynamics:
             self.loads.refresh(self._u[: 3 * self.mesh.node_count])
         if self._touched or len(self._elastic.force) != self.mesh.node_count:
             self._begin_account()  # a pass over the tissue, which must not slow down a batch
-        if self.mass.follows_strain:
+        if self.masses.follows_strain:
             operands = self._far.operands() if self._far else self.model.operands()
-            self.mass.begin(self._u[: 3 * self.mesh.node_count], operands)
-        substeps, dt = self.steps.begin(couplings)
+            self.masses.begin(self._u[: 3 * self.mesh.node_count], operands)
+        substeps, dt = self.time_steps.begin(couplings)
         self._hold_back(_is_free(couplings, tools))
         before = (self._u.copy(), self._v.copy())
         met = self.cut_contact.kept()
@@ -193,7 +195,7 @@ class Dynamics:
         trouble = ''
         while True:
             work, contacts, taken = self._integrate(couplings, dt, substeps, tools)
-            slow = dt * substeps / self.steps.frame_time
+            slow = dt * substeps / self.time_steps.frame_time
             motion = self._motion(slow, taken, trouble, contacts)
             energy = motion.kinetic_energy + motion.elastic_energy
             # Cut faces that begin in one another are moved apart: energy of no unstable step.
@@ -210,7 +212,7 @@ class Dynamics:
             trouble = trouble or f'{found}: {self._cause(couplings, dt)}'
             self._u, self._v = before[0].copy(), before[1].copy()
             self._turn_back()
-            finer = self.steps.refine()
+            finer = self.time_steps.refine()
             if not finer:
                 break
             self._touched.append(np.arange(self.mesh.node_count))
@@ -228,7 +230,7 @@ class Dynamics:
             held = self.mesh.fixed.any()
             self._loose = np.flatnonzero(free_parts(self.mesh)) if held else np.zeros(0, np.int64)
         if self._loose is not None and len(self._loose):
-            self.velocity[self._loose] *= np.exp(-_DRAG * self.steps.frame_time)
+            self.velocity[self._loose] *= np.exp(-_DRAG * self.time_steps.frame_time)
 
     def _hold_lost(self, u: np.ndarray, v: np.ndarray) -> bool:
         """Return to the start of the frame, with lost pieces held in their shapes at rest.
@@ -248,7 +250,7 @@ class Dynamics:
         for own in (np.flatnonzero(piece == p) for p in np.unique(piece[lost])):
             shape[own] = shape[own].mean(axis=0)  # else it would stay strained for ever
         v[: 3 * n].reshape(-1, 3)[lost] = 0.0
-        self.mass.hold(lost)
+        self.masses.hold(lost)
         self._u, self._v = u.copy(), v.copy()
         self._turn_back()
         self._touched.append(np.arange(n))
@@ -270,16 +272,18 @@ class Dynamics:
         u, v = self._state()
         if isinstance(self._active, FarField):
             if _is_free(couplings):
-                self._active.relax(u, self._elastic.force, self.mass.inverse, self.mass.omega)
+                self._active.relax(u, self._elastic.force, self.masses.inverse, self.masses.omega)
                 self._elastic.whole(self.displacement)
             force = self._elastic.force
-            return self._active.choose(u, v, force, self.mass.inverse, couplings, self.mass.omega)
+            return self._active.choose(
+                u, v, force, self.masses.inverse, couplings, self.masses.omega
+            )
         b = self.material.beta
         some = len(contacts.nodes) and not self._active.whole
         pressed = self.cut_contact.force(contacts, u, v) if some else None
-        at = u, v, b, self.mass.inverse
+        at = u, v, b, self.masses.inverse
         met = contacts.nodes.ravel(), pressed
-        return self._active.choose(*at, held_nodes(couplings), self.steps.frame_time, met)
+        return self._active.choose(*at, held_nodes(couplings), self.time_steps.frame_time, met)
 
     def _integrate(
         self, couplings: Sequence[Coupling], dt: float, substeps: int, tools: Sequence[Tool]
@@ -320,12 +324,14 @@ class Dynamics:
             if faces is None:
                 contacts = near.among(self._active.move(near.nodes))
                 faces = self._meeting(contacts, region)
-            steps = self._active.ahead(substeps - done, substeps, self.mass.omega / self.mass.uncut)
-            if self.mass.follows_strain:
+            steps = self._active.ahead(
+                substeps - done, substeps, self.masses.omega / self.masses.uncut
+            )
+            if self.masses.follows_strain:
                 if done >= adapt:
                     operands = region.operands if self._far else self.model.operands()
                     begun = done == 0 and self._far is None
-                    self.mass.adapt(self._u[:size], moving, operands, begun=begun)
+                    self.masses.adapt(self._u[:size], moving, operands, begun=begun)
                     adapt = done + SUBSTEPS_BETWEEN
                 steps = min(steps, adapt - done)
             if self.loads is not None:
@@ -343,7 +349,7 @@ class Dynamics:
                 positions = self.positions
                 couplings = [tool.after(done / substeps, positions) for tool in tools]
                 springs = springs_of(couplings, self.mesh.rest)
-                finer = self.steps.parts(couplings, dt)
+                finer = self.time_steps.parts(couplings, dt)
                 if finer > 1:
                     done, substeps, dt = finer * done, finer * substeps, dt / finer
                     look, adapt = finer * look, finer * adapt
@@ -383,7 +389,7 @@ class Dynamics:
         place = region.place
         at = slice(None) if place is None else place.at
         u, v = (values[at] for values in self._state())
-        inverse, diagonal = self.mass.present_inverse, self.model.diagonal
+        inverse, diagonal = self.masses.present_inverse, self.model.diagonal
         if self._far is not None:
             inverse = self._far.inverse(inverse)
             if self.stepping.integrator == 'implicit':
@@ -418,12 +424,14 @@ class Dynamics:
             force = force - self.cut_contact.force(contacts, *self._state())
         elastic += self._load_energy()
         kinetic = self._kinetic_energy()
-        strain = self.mass.strain
+        strain = self.masses.strain
         return FrameMotion(force, kinetic, elastic, substeps, slow, trouble, strain=strain)
 
     def _cause(self, couplings: Sequence[Coupling], dt: float) -> str:
-        name, bound = self.stepping.integrator, self.steps.bound(couplings)
-        limit = f'the {1e3 * bound:.3g} ms at which {name} is stable at {self.mass.omega:.4g} rad/s'
+        name, bound = self.stepping.integrator, self.time_steps.bound(couplings)
+        limit = (
+            f'the {1e3 * bound:.3g} ms at which {name} is stable at {self.masses.omega:.4g} rad/s'
+        )
         if dt > bound:
             return f'a step of {1e3 * dt:.3g} ms is above {limit}'
         inverted = self.inverted
@@ -460,7 +468,7 @@ class Dynamics:
         self.model.update(touched)
         if self.loads is not None:
             self.loads.apply_cut(n, delta, touched)
-        self.mass.follow_cut(touched.nodes)
+        self.masses.follow_cut(touched.nodes)
         self._touched.append(touched.nodes)
         self._active.follow_cut(touched)
         velocity = self._state()[1][3 * self.mesh.node_count :]
@@ -514,7 +522,7 @@ class Dynamics:
 
     def _kinetic_energy(self) -> float:
         moving = None if self._active.whole else self._active.nodes  # the others are at rest
-        return self.mass.kinetic_energy(self.velocity, moving)
+        return self.masses.kinetic_energy(self.velocity, moving)
 
 
 def _is_free(couplings: Sequence[Coupling], tools: Sequence[Tool] = ()) -> bool:

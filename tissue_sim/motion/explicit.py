@@ -65,7 +65,7 @@ def euler_steps(
     the tissue's beta.
 
     Args:
-        operands: of the model, see `elasticity.Operands`.
+        operands: of the model, see `elastic_force.Operands`.
         spans: intervals of moving nodes, shape (s, 2).
         inverse_mass: by coordinate, 0 where fixed [1/kg], shape (3 n,).
         damping: alpha [1/s] and beta [s].

@@ -94,6 +94,8 @@ class TimeSteps:
     def begin(self, couplings: Sequence[Coupling]) -> tuple[int, float]:
         """Return the number of steps of the next frame, and their length [s].
 
+        Some frames after one that diverged have shorter steps, and are counted here.
+
         Args:
             couplings: springs of the tools at its start.
         """
@@ -122,7 +124,9 @@ class TimeSteps:
         return min(int(np.ceil(dt / (self._stepping.safety * bound))), _FINEST)
 
     def refine(self) -> int:
-        """Take shorter steps for some frames; return by what factor, 0 where none are left."""
+        """Take shorter steps for some frames; return the factor, or 0 where there are none shorter:
+        the next frame has those of before.
+        """
         if self._caution * _FINER > self._finest:
             self._caution = 1
             return 0

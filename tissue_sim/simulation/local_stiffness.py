@@ -154,7 +154,7 @@ class ContactStiffness:
         self, point: PointCompliance, nodes: np.ndarray, weights: np.ndarray, axes: np.ndarray
     ) -> np.ndarray:
         d = self._dynamics
-        return point.estimate(d.model, d.mass.inverse > 0, nodes, weights, axes)
+        return point.estimate(d.model, d.masses.inverse > 0, nodes, weights, axes)
 
 
 class GrippingStiffness(ContactStiffness):

@@ -131,23 +131,29 @@ def check_simulation(simulation: TissueSimulation) -> None:
     model = dynamics.model
     n = mesh.node_count
     check_mesh(mesh)
-    meshes = (dynamics.mesh, model.mesh, dynamics.mass._model.mesh)
+    meshes = (dynamics.mesh, model.mesh)
     parts: list[Any] = [model.tensor_mass, model._domains, model._elements, model._neighbours]
     inner = tuple(part._mesh for part in parts if part is not None)
     if any(other is not mesh for other in meshes + inner):
         raise StateError('its parts are of different meshes')
+    mass = dynamics.masses
+    owners = (mass, mass._frequency, mass._stiffened, dynamics._elastic, dynamics._active)
+    if any(owner is not None and owner._model is not model for owner in owners):
+        raise StateError('its parts are of different models')
+    if dynamics.time_steps._mass is not mass:
+        raise StateError('its time steps are of other masses')
     for name in ('_u', '_v'):
         has_room(name, getattr(dynamics, name), 3 * n)
-    has_room('_inverse', dynamics.mass._inverse, 3 * n)
-    has_room('_inertia', dynamics.mass._inertia, n)
+    has_room('_inverse', dynamics.masses._inverse, 3 * n)
+    has_room('_inertia', dynamics.masses._inertia, n)
     has_room('_pull', dynamics.cut_contact._pull, 0, 3)
     if dynamics.cut_contact._mesh is not mesh:
         raise StateError('the cut faces are of another tissue')
     if dynamics._loose is not None:
         within('_loose', dynamics._loose, n)
     _check_loads(dynamics, n)
-    if dynamics.mass._stiffened is not None:
-        has_room('_linear', dynamics.mass._stiffened._linear, n)
+    if dynamics.masses._stiffened is not None:
+        has_room('_linear', dynamics.masses._stiffened._linear, n)
     regions = len(model.material.relative_stiffness)
     within('region', mesh.regions, regions)
     for tool in simulation.tools:
@@ -282,7 +288,7 @@ def _check_law_operands(operands: Operands) -> None:
 def _check_estimates(simulation: TissueSimulation, n: int) -> None:
     """Check the estimates of frequency and compliance, and the integrator."""
     dynamics = simulation.dynamics
-    has_room('_f', dynamics.mass._frequency._f, 0)
+    has_room('_f', dynamics.masses._frequency._f, 0)
     work: Any = dynamics._integrator._work
     has_room('_work', work, 7, *work.shape[1:])
     has_room('_damping', dynamics._integrator._damping, 2)
