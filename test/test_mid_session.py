@@ -26,8 +26,10 @@ from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import pose_check, recomputation
 from cutting_trainer.recordings.what_if import Hand, closed_loop, recorded_run, run_experiment
 from cutting_trainer.session.scene_loader import Scene, load_scene
+from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
 from cutting_trainer.tissue_sim.contact.tool import ContactState, Frame
+from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.simulation.serialisation import (
     ObjectState,
     StateError,
@@ -35,7 +37,8 @@ from cutting_trainer.tissue_sim.simulation.serialisation import (
     classes_of,
     rebuild,
 )
-from cutting_trainer.tissue_sim.simulation.state import from_state, state_of
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
+from cutting_trainer.tissue_sim.simulation.state import from_state, smallest_mesh, state_of
 
 pytestmark = pytest.mark.long
 
@@ -344,6 +347,15 @@ def test_a_state_whose_numbers_lead_out_of_its_arrays_is_refused_in_one_sentence
     states = state_of(simulation), memory.state()
     with pytest.raises(StateError, match='the recorded state cannot be used: '):
         from_state(states[0]), memory_of(states[1], method)
+
+
+@pytest.mark.parametrize('part', ['masses', '_elastic', '_active'])
+def test_a_state_whose_parts_are_of_different_models_is_refused(part: str) -> None:
+    material, resistance = Material(1e4, 0.4, 1e3, 1.0, 1e-3), Resistance(1.0, 1.0, 1.0)
+    one, other = (TissueSimulation(smallest_mesh(), material, resistance) for _ in range(2))
+    setattr(one.dynamics, part, getattr(other.dynamics, part))
+    with pytest.raises(StateError, match='its parts are of different models'):
+        from_state(state_of(one))
 
 
 @dataclass
