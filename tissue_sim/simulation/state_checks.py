@@ -144,16 +144,16 @@ def check_simulation(simulation: TissueSimulation) -> None:
         raise StateError('its time steps are of other masses')
     for name in ('_u', '_v'):
         has_room(name, getattr(dynamics, name), 3 * n)
-    has_room('_inverse', dynamics.masses._inverse, 3 * n)
-    has_room('_inertia', dynamics.masses._inertia, n)
+    has_room('_inverse', mass._inverse, 3 * n)
+    has_room('_inertia', mass._inertia, n)
     has_room('_pull', dynamics.cut_contact._pull, 0, 3)
     if dynamics.cut_contact._mesh is not mesh:
         raise StateError('the cut faces are of another tissue')
     if dynamics._loose is not None:
         within('_loose', dynamics._loose, n)
     _check_loads(dynamics, n)
-    if dynamics.masses._stiffened is not None:
-        has_room('_linear', dynamics.masses._stiffened._linear, n)
+    if mass._stiffened is not None:
+        has_room('_linear', mass._stiffened._linear, n)
     regions = len(model.material.relative_stiffness)
     within('region', mesh.regions, regions)
     for tool in simulation.tools:
