@@ -297,7 +297,7 @@ def _check_estimates(simulation: TissueSimulation, n: int) -> None:
 def _check_far_field(dynamics: Any, n: int) -> None:
     far = dynamics._far
     grid, stiffness, model = far._grid, far._stiffness, dynamics.model
-    if dynamics._active is not far or far._model is not model or stiffness._model is not model:
+    if dynamics._active is not far or stiffness._model is not model:
         raise StateError('the far field is of another tissue')
     if stiffness._grid is not grid or grid._mesh is not model.mesh:
         raise StateError('the far field has another grid')
