@@ -30,7 +30,7 @@ from cutting_trainer.tissue_sim.elasticity.rotation import (
     rotation_step,
 )
 from cutting_trainer.tissue_sim.elasticity.stiffening import MAX_EXPONENT
-from cutting_trainer.tissue_sim.elasticity.viscosity import _conjugate
+from cutting_trainer.tissue_sim.elasticity.viscous_stress import _conjugate
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.far_field import _strain_domains
 
