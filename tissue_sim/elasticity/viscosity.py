@@ -11,7 +11,7 @@ they follow the present T. For a linear law no motion whatever gains energy from
 a = 1 - exp(-dt / tau), summation by parts of the work leaves - (1 / a - 1 / 2) |change of s|^2.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,10 +22,27 @@ from cutting_trainer.tissue_sim.elasticity.viscous_stress import (
     LAW,
     LINEAR,
     TURNING,
-    ViscousNodes,
     relieve,
 )
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta, Touched, carried_over, grown
+
+
+class ViscousNodes(NamedTuple):
+    """State by node.
+
+    Attributes:
+        terms: KEPT numbers for each term, shape (n, KEPT k).
+        relief: stress that the load stands for, by rows [Pa], shape (n, 9).
+        since: simulated time of the last change [s], shape (n,).
+        energy: what the terms add to the elastic energy, negative or positive [J], shape (n,).
+        rotation: quaternions, shape (n, 4).
+    """
+
+    terms: np.ndarray
+    relief: np.ndarray
+    since: np.ndarray
+    energy: np.ndarray
+    rotation: np.ndarray
 
 
 class Viscosity:

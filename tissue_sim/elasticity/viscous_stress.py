@@ -4,7 +4,6 @@ A chunk holds LANES nodes, slot by slot, see `rotation`: loops over lanes run on
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,26 +32,6 @@ KEPT = 7
 LINEAR, TURNING, LAW = 0, 1, 2
 _ROTATION_TOLERANCE = 1e-9
 """[rad]; its square is the error of a stress."""
-
-
-class ViscousNodes(NamedTuple):
-    """State by node.
-
-    Attributes:
-        terms: KEPT numbers for each term, shape (n, KEPT k).
-        relief: stress that the load stands for, by rows [Pa], shape (n, 9).
-        since: simulated time of the last change [s], shape (n,).
-        energy: what the terms add to the elastic energy, negative or positive [J], shape (n,).
-        rotation: quaternions, shape (n, 4).
-    """
-
-    terms: np.ndarray
-    relief: np.ndarray
-    since: np.ndarray
-    energy: np.ndarray
-    rotation: np.ndarray
-
-
 _TURN = SLOTS
 """First slot of R by rows, after the slots of `rotation`."""
 _RESULT, _STRAIN, _TERM, _TOTAL = SLOTS + 9, SLOTS + 15, SLOTS + 21, SLOTS + 27

@@ -17,8 +17,8 @@ from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands
 from cutting_trainer.tissue_sim.elasticity.local_rows import Locality
 from cutting_trainer.tissue_sim.elasticity.nodal_smoothing import NodalSmoothing, SmoothingDomains
 from cutting_trainer.tissue_sim.elasticity.rotation import LANES
+from cutting_trainer.tissue_sim.elasticity.viscosity import ViscousNodes
 from cutting_trainer.tissue_sim.elasticity.viscous_stress import KEPT as KEPT_OF_TERM
-from cutting_trainer.tissue_sim.elasticity.viscous_stress import ViscousNodes
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.simulation.serialisation import StateError
