@@ -6,7 +6,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -39,6 +39,9 @@ from cutting_trainer.tissue_sim.simulation.serialisation import StateError
 from cutting_trainer.tissue_sim.simulation.state import from_state, shape_of
 from cutting_trainer.tissue_sim.warm_up import warm_up_method
 
+_OF_THE_BEGINNING = ('tissue.mesh', 'tissue.unit', 'tissue.fixed', 'tissue.stretch')
+"""Keys that make the shape of a tissue as a session begins."""
+
 
 def resimulate(folder: Path, changes: Mapping[str, str], *, as_json: bool = False) -> Status:
     """Recompute a session and print the comparison.
@@ -60,8 +63,27 @@ def resimulate(folder: Path, changes: Mapping[str, str], *, as_json: bool = Fals
         if changes:
             changed = load_changed(restore_scene(bag, Path(temporary), changes), changes)
             warm_up_cutting(changed.cutting)
+            refuse_lost_changes(find_beginning(bag), changes)
             return _experiment(bag, scene, changed, changes, as_json=as_json)
         return _verify(bag, scene, as_json=as_json)
+
+
+def refuse_lost_changes(beginning: ComputationStart, keys: Collection[str]) -> None:
+    """Refuse changes without effect on a bag that begins with the shape of a tissue.
+
+    Args:
+        beginning: of the bag.
+        keys: dotted, of the changed values.
+
+    Raises:
+        SessionError: there is one.
+    """
+    lost = [key for key in keys if key in _OF_THE_BEGINNING]
+    if lost and beginning.tissue is not None:
+        raise SessionError(
+            f'{lost[0]} cannot be changed: the bag begins in mid-session, with its own mesh. '
+            'Take a bag with the beginning of its session'
+        )
 
 
 def recomputation(

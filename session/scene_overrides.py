@@ -5,6 +5,7 @@ import re
 from collections.abc import Collection, Mapping
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
@@ -106,11 +107,7 @@ def change(scene: dict[str, object], key: str, value: str) -> None:
     *path, last = key.split('.')
     if not path:
         raise SessionError(f'--with {key}: give section and key, as in cutting.{key}')
-    try:
-        check_yaml(value)
-        new = YAML(typ='safe', pure=True).load(value)
-    except (YAMLError, ValueError):
-        raise SessionError(f'--with {key}: {value!r} is not a value in YAML') from None
+    new = value_of(key, value)
     place = scene
     for part in path:
         inner = place.setdefault(part, {})
@@ -118,6 +115,19 @@ def change(scene: dict[str, object], key: str, value: str) -> None:
             raise SessionError(f'--with {key}: {part} has no keys, it is a value')
         place = inner
     place[last] = new
+
+
+def value_of(key: str, text: str) -> Any:
+    """Return the value that YAML has for a changed key.
+
+    Raises:
+        SessionError: it is none.
+    """
+    try:
+        check_yaml(text)
+        return YAML(typ='safe', pure=True).load(text)
+    except (YAMLError, ValueError):
+        raise SessionError(f'--with {key}: {text!r} is not a value in YAML') from None
 
 
 def tissue_changes(tissue: TissueSettings, factors: Mapping[str, float]) -> dict[str, str]:

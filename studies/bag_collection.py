@@ -85,11 +85,13 @@ def find_attempts(folder: Path, subject: str, exercise: str) -> tuple[list[str],
 
 
 def _bags_by(pattern: str, folder: Path) -> list[Path]:
-    whole = folder / Path(pattern).expanduser()
-    # Path.glob takes no absolute pattern.
-    matches = [Path(match) for match in sorted(glob.glob(str(whole), recursive=True))]  # noqa: PTH207
-    if whole.exists() and not matches:  # a name with brackets is a name, too
-        matches = [whole]
+    try:
+        whole = folder / Path(pattern).expanduser()
+    except RuntimeError as error:  # there is no such user
+        raise SessionError(f'{pattern}: {error}') from None
+    # A name with brackets is a name, too. Path.glob takes no absolute pattern.
+    found = [str(whole)] if whole.exists() else sorted(glob.glob(str(whole), recursive=True))  # noqa: PTH207
+    matches = [Path(match) for match in found]
     bags = [bag for match in matches if match.is_dir() for bag in _bags_below(match)]
     if not bags:
         if all(match.suffix == '.mcap' for match in matches) and matches:
@@ -100,7 +102,7 @@ def _bags_by(pattern: str, folder: Path) -> list[Path]:
             reason = 'no file matches it'
         else:
             reason = missing_file(whole)
-        raise SessionError(f'bags has {pattern!r}, and {reason}')
+        raise SessionError(f'{pattern}: {reason}')
     return list(dict.fromkeys(bags))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import dask
 from distributed import Client, KilledWorker, LocalCluster, Status, as_completed
+from distributed.system import MEMORY_LIMIT
 from tornado.ioloop import PeriodicCallback
 
 from cutting_trainer.session.errors import SessionError
@@ -21,6 +22,8 @@ MAX_DEATHS = 5
 """Workers that a row may lose, killed or out of memory, before it counts as failed."""
 MAX_MEMORY_BYTES = 4 * 10**9
 """Memory of an own worker, above which it is killed; it has its share of the machine's, if less."""
+_NEEDED_MEMORY_BYTES = 8 * 10**8
+"""Memory of the machine for each own worker: with its kernels one takes 0.5 GB."""
 WORKERS_TIMEOUT_S = 60.0
 """Time for the first worker of somebody else's, and for own ones on a machine that does nothing
 else: 20 times the 3 s of processor time that the start of a worker takes."""
@@ -37,16 +40,20 @@ _PER_THREAD = 2
 def own_cluster(workers: int) -> Iterator[Client]:
     """Start workers in processes of their own, one thread each, and connect to them.
 
-    They end with this process, however it ends.
+    They end with this process, however it ends. There are fewer where the memory is too small.
     """
+    whole = int(MEMORY_LIMIT)  # of the container, if that has less than the machine
+    workers = max(min(workers, whole // _NEEDED_MEMORY_BYTES), 1)
     with dask.config.set(
         {
             'distributed.scheduler.allowed-failures': MAX_DEATHS,
             'distributed.scheduler.worker-saturation': 1.0,
+            # A paused worker would wait for ever: its memory does not fall.
+            'distributed.worker.memory.pause': False,
             'distributed.deploy.lost-worker-timeout': f'{_LOST_TIMEOUT_S:.0f} s',
         }
     ):
-        memory = min(MAX_MEMORY_BYTES, int(_machine_memory() / workers))
+        memory = min(MAX_MEMORY_BYTES, whole // workers)
         logging.getLogger('distributed').setLevel(logging.CRITICAL)
         with (
             LocalCluster(
@@ -98,12 +105,6 @@ def restore_workers(cluster: Any) -> None:
         cluster.scale(len(cluster.worker_spec))
 
 
-def _machine_memory() -> int:
-    from distributed.system import MEMORY_LIMIT  # of the container, if that has less
-
-    return int(MEMORY_LIMIT)
-
-
 @contextlib.contextmanager
 def others_cluster(address: str) -> Iterator[Client]:
     """Connect to a scheduler, wait for a worker, and check the versions of all.
@@ -114,7 +115,7 @@ def others_cluster(address: str) -> Iterator[Client]:
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=10)
-    except (OSError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError, TypeError, ImportError) as error:
         raise SessionError(
             f'--scheduler {address}: no Dask scheduler answers there '
             f'({" ".join(str(error).split())[:150]}): start one with `./trainer run dask scheduler`'

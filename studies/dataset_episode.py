@@ -110,11 +110,11 @@ def read_episode(bag: StudyBag, metadata: SessionMetadata) -> Episode:
     streams = {}
     for feature, (topic, codec, names, _) in STREAMS.items():
         streams[feature] = _stream(opened, topic, codec(), names, bag.name)
-    stamps, poses, delay = streams[STATE]
+    stamps, (_, poses, delay) = streams[FORCES][0], streams[STATE]
     period = float(np.median(np.diff(stamps))) * 1e-9
     rate = max(round(1.0 / period), 1)
     if abs(rate * period - 1.0) > _RATE_TOLERANCE:
-        raise BagError(f'{bag.name} has poses every {period:.4g} s: that is no whole rate')
+        raise BagError(f'{bag.name} has forces every {period:.4g} s: that is no whole rate')
     begin = max(int(of[0]) for of, *_ in streams.values())
     end = int(stamps[-1])
     if end <= begin:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -29,7 +29,7 @@ from cutting_trainer.studies.outputs import OUTPUTS
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MAX_SETTINGS = 100_000
-"""Settings of a study; each is computed for each bag."""
+"""Settings of a grid, and samples of a design; each is computed for each bag."""
 MODELS: dict[str, type[BaseModel]] = {
     'tissue': TissueSettings,
     'tool': ToolSettings,
@@ -68,6 +68,8 @@ def _fields(key: str) -> list[FieldInfo]:
     models: list[type[BaseModel]] = [MODELS[section]]
     fields: list[FieldInfo] = []
     for part in path:
+        if any(get_origin(field.annotation) in (list, tuple) for field in fields):
+            raise ValueError(f'{part} is in a list: give the whole list before it')
         fields = [m.model_fields[part] for m in models if part in m.model_fields]
         if not fields:
             known = list(dict.fromkeys(name for m in models for name in m.model_fields))
@@ -125,9 +127,10 @@ class Sobol(Sampled):
     def _balanced(self) -> Self:
         if self.samples & (self.samples - 1):
             power = 1 << self.samples.bit_length()
+            above = f' or {power}' if power <= MAX_SETTINGS else ''
             raise ValueError(
                 f'samples is {self.samples}: a Sobol sequence is balanced for powers of two, '
-                f'as {power // 2} or {power}'
+                f'as {power // 2}{above}'
             )
         return self
 
@@ -209,7 +212,7 @@ def _wrong_values(study: Study) -> list[ErrorDetails]:
         ErrorDetails(type='value_error', loc=('settings', *place), msg=said, input=value,
                      ctx={'error': said})
         for place, key, value in _values(study.settings)
-        if (said := _refusal(key, value))
+        if (said := _refusal(key, value, sampled='ranges' in place))
     ]  # fmt: skip
 
 
@@ -226,18 +229,20 @@ def _values(designs: Designs) -> Iterator[tuple[tuple[int | str, ...], str, Json
                 yield (name, 'ranges', key, end), key, getattr(within, end)
 
 
-def _refusal(key: str, value: JsonValue) -> str:
-    """Return why a scene key cannot have a value; '': it can."""
+def _refusal(key: str, value: JsonValue, *, sampled: bool) -> str:
+    """Return why a scene key cannot have a value, or values around it; '': it can."""
     said = ''
     for field in _fields(key):
-        if field.annotation is Path:  # relative to the restored scene, which is not there yet
-            return ''
+        if field.annotation is Path:  # relative to the study file
+            return '' if isinstance(value, str) else f'{json.dumps(value)[:60]} is no path'
         kind: Any = Annotated[(field.annotation, field)]
         adapter: TypeAdapter[Any] = TypeAdapter(kind)
         try:
             adapter.validate_json(json.dumps(value), strict=True)
         except ValidationError as error:
             first = error.errors()[0]
+            if sampled and first['type'].startswith('int'):
+                return 'a range gives real values, and this key takes whole ones: use a grid'
             reason = first['msg'][:1].lower() + first['msg'][1:]
             about = f' ({field.description})' if field.description else ''
             said = f'{json.dumps(value)[:60]} is refused: {reason}{about}'

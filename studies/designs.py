@@ -2,9 +2,12 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +19,7 @@ from cutting_trainer.studies.description import Designs, Range, Sampled, Sobol
 _DIGITS = 6
 """Significant digits of a sampled value: it is read by people, too."""
 _HASH_DIGITS = 16
+MESH_KEY = 'tissue.mesh'
 
 
 @dataclass(frozen=True)
@@ -30,11 +34,16 @@ class Setting:
     number: int
     changes: dict[str, JsonValue]
 
-    @property
+    @cached_property
     def identity(self) -> str:
-        """Hash of the changes, whatever their order."""
-        text = json.dumps(self.changes, sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:_HASH_DIGITS] if self.number else ''
+        """Hash of the changes, whatever their order, and of a mesh that they name."""
+        if not self.number:
+            return ''
+        text = json.dumps(_plain(self.changes), sort_keys=True).encode()
+        mesh = self.changes.get(MESH_KEY)
+        if isinstance(mesh, str) and Path(mesh).is_file():
+            text += hashlib.sha256(Path(mesh).read_bytes()).digest()
+        return hashlib.sha256(text).hexdigest()[:_HASH_DIGITS]
 
     @property
     def in_yaml(self) -> dict[str, str]:
@@ -46,7 +55,8 @@ class Setting:
         """The changes in a few words."""
         if not self.number:
             return 'as recorded'
-        words = (f'{key.rpartition(".")[2]}={_short(value)}' for key, value in self.changes.items())
+        names = short_names(self.changes)
+        words = (f'{names[key]}={_short(value)}' for key, value in self.changes.items())
         return ', '.join(words) or 'unchanged'
 
 
@@ -54,10 +64,18 @@ RECORDED = Setting(0, {})
 """The session as recorded: the reference of all others."""
 
 
-def settings_of(designs: Designs) -> list[Setting]:
-    """Return the settings of all designs, each once, in the order of the study file."""
+def settings_of(designs: Designs, folder: Path = Path()) -> list[Setting]:
+    """Return the settings of all designs, each once, in the order of the study file.
+
+    Args:
+        designs: of the study.
+        folder: of the study file, to which a mesh is relative.
+    """
     found: dict[str, Setting] = {}
     for changes in _all_changes(designs):
+        mesh = changes.get(MESH_KEY)
+        if isinstance(mesh, str):
+            changes = {**changes, MESH_KEY: str(folder.resolve() / mesh)}
         setting = Setting(len(found) + 1, changes)
         found.setdefault(setting.identity, setting)
     return list(found.values())
@@ -97,6 +115,22 @@ def _value(within: Range, share: float) -> float:
     else:
         value = within.low + share * (within.high - within.low)
     return float(f'{value:.{_DIGITS}g}')
+
+
+def short_names(keys: Iterable[str]) -> dict[str, str]:
+    """Return the last word of each dotted key, or the whole of those that share it."""
+    last = {key: key.rpartition('.')[2] for key in keys}
+    counts = Counter(last.values())
+    return {key: word if counts[word] == 1 else key for key, word in last.items()}
+
+
+def _plain(value: JsonValue) -> JsonValue:
+    """Return a value with whole numbers as integers: 3 and 3.0 are one setting."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _short(value: JsonValue) -> str:

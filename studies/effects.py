@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 from scipy.stats import bootstrap
 
-from cutting_trainer.studies.designs import RECORDED, Setting
+from cutting_trainer.studies.designs import RECORDED, Setting, short_names
 from cutting_trainer.studies.table import Row, as_text
 
 Floats = NDArray[np.float64]
@@ -91,13 +91,13 @@ def effects_of_keys(
     """
     settings = _settings(rows)
     keys = list(dict.fromkeys(key for setting in settings for key in setting.changes))
-    if len(keys) < 2:
+    if not keys:
         return [], ''
     if any(len(setting.changes) < len(keys) for setting in settings):
         return [], 'settings change different keys, so the keys have no effects of their own'
     columns = dict[str, Floats]()
-    for key in keys:
-        columns |= _columns(key, [setting.changes[key] for setting in settings])
+    for key, name in short_names(keys).items():
+        columns |= _columns(name, [setting.changes[key] for setting in settings])
     design = np.column_stack([np.ones(len(settings)), *columns.values()])
     values = _by_setting(rows)
     found = dict[str, list[Floats]]()
@@ -159,9 +159,8 @@ def _by_setting(rows: Sequence[Row]) -> dict[str, dict[str, Mapping[str, float]]
     return found
 
 
-def _columns(key: str, values: Sequence[JsonValue]) -> dict[str, Floats]:
+def _columns(name: str, values: Sequence[JsonValue]) -> dict[str, Floats]:
     """Return regressors from 0 to 1 of one key, by a name that says the change."""
-    name = key.rpartition('.')[2]
     numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
     if len(numbers) == len(values):
         given = np.array(numbers, float)

@@ -1,6 +1,5 @@
 """One row of a study, computed by a worker: a bag under a setting."""
 
-import resource
 import tempfile
 import time
 import traceback
@@ -8,6 +7,9 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.bags.reader import Bag, open_bag
@@ -27,7 +29,7 @@ from cutting_trainer.haptic_bridge.warm_up import warm_up as warm_up_force_path
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.errors import MeshError, SceneError
 from cutting_trainer.recordings.recorded_scene import restore_scene
-from cutting_trainer.recordings.resimulate_command import recomputation
+from cutting_trainer.recordings.resimulate_command import recomputation, refuse_lost_changes
 from cutting_trainer.recordings.what_if import (
     RecordedForce,
     Run,
@@ -45,7 +47,14 @@ from cutting_trainer.studies.identity import Identity, identity_of_worker
 from cutting_trainer.studies.outputs import outputs_of
 from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
 
-_SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError)
+
+class UnavailableError(RuntimeError):
+    """A worker cannot reach a bag."""
+
+
+_SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError, UnavailableError)
+_PASSING = (UnavailableError, OSError, MemoryError)
+"""Errors of a machine, which another start may not meet."""
 _MAX_REASON = 500
 """Characters of a reason."""
 _KEPT_BAGS = 2
@@ -85,7 +94,7 @@ class Result:
         warm_up: processor time of that [s]; 0 for all but its first row.
         memory: largest resident memory of the worker so far [bytes].
         lost: no worker has computed it, for a reason that is not that of bag or setting.
-        series: force on the hand at each pose, where the job asks for it.
+        series: force on the hand at each pose [N], shape (n, 3), where the job asks for it.
     """
 
     outputs: dict[str, float]
@@ -96,7 +105,7 @@ class Result:
     warm_up: float
     memory: int
     lost: bool = False
-    series: RecordedForce | None = None
+    series: NDArray[np.float64] | None = None
 
 
 class OtherCodeError(RuntimeError):
@@ -135,14 +144,14 @@ def evaluate(job: Job) -> Result:
     began = time.thread_time()
     warm_up()
     warm, differs, failure, outputs = time.thread_time(), 0, '', dict[str, float]()
-    series: RecordedForce | None = None
+    lost, series = False, None
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
             outputs, differs, run = _compute(job, Path(temporary))
-            if job.series:
-                series = RecordedForce(run.times, run.forces, run.contact, run.vectors)
+            series = run.vectors if job.series else None
         except Exception as error:  # a row with its reason: the study goes on
             failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
+            lost = isinstance(error, _PASSING)
     return Result(
         outputs=outputs,
         failure=failure,
@@ -150,9 +159,19 @@ def evaluate(job: Job) -> Result:
         identity=here,
         cpu=time.thread_time() - warm,
         warm_up=warm - began,
-        memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        memory=_largest_memory(),
+        lost=lost,
         series=series,
     )
+
+
+def _largest_memory() -> int:
+    """Return the largest resident memory of this process so far [bytes].
+
+    `getrusage` would count that of the process that started it.
+    """
+    status = Path('/proc/self/status').read_text(encoding='ascii', errors='replace')
+    return int(status.partition('VmHWM:')[2].split()[0]) * 1024
 
 
 @cache
@@ -175,6 +194,7 @@ def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int, Run]:
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
     scene = load_scene(str(restore_scene(bag, folder, job.setting.in_yaml)))
     changed, differs = job.setting.number > 0, None
+    refuse_lost_changes(beginning, job.setting.changes)
     computed = recomputation(scene, beginning, changed=changed)
     if changed:
         run = move_hand(recording.records, recording.poses, recording.indexings, scene, computed)
@@ -189,9 +209,12 @@ def read_recording(folder: str, expected_hash: str) -> Recording:
     """Read a bag.
 
     Raises:
+        UnavailableError: its folder is not there.
         BagError: it is unreadable, or another one than that of the study.
         SessionError: the bag has no poses, or no forces of the hand.
     """
+    if not Path(folder).is_dir():
+        raise UnavailableError(f'{folder} is not there on this worker: give all the same folders')
     if hash_of_bag(Path(folder)) != expected_hash:
         raise BagError(f'{folder} is not the bag that the study was started with: it has changed')
     bag = open_bag(folder)

@@ -90,7 +90,6 @@ class Fit:
         self._lead = lead
         self._without_jumps = [deviations(o.times, o.felt, noise) for o in observations]
         self._deviations = list(self._without_jumps)
-        self._felt = [window_means(o.times, o.felt) for o in observations]
         self._mean = np.log([prior.median for prior in priors.values()])
         self._spread = np.array([prior.spread for prior in priors.values()])
         self._known: dict[tuple[int, Point], Floats] = {}

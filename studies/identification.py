@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 from scipy.stats import t as student
 
 from cutting_trainer.tissue_sim.material_presets import PRESETS
@@ -57,7 +58,7 @@ _UNCLEAR = 0.3
 """Half of an interval, as a logarithm, above which the correlated constant is named."""
 _CORRELATED = 0.9
 _SCALE_ROUNDS = 3
-_TAIL = float(student.ppf(0.975, 1e6))
+_TAIL = float(norm.ppf(0.975))
 """Half of an interval of 95 % of a normal distribution, in standard deviations."""
 
 
@@ -89,7 +90,8 @@ def prior_of(name: str, recorded: float) -> Prior:
         spread = max(float(logs.std(ddof=1)), _MIN_SPREAD)
         return Prior(float(np.exp(logs.mean())), spread, f'{len(values)} presets')
     median = recorded or {'stiffening': 9.2, 'friction': 0.1}.get(name, 1.0)
-    return Prior(median, _FREE_SPREAD, 'the scene, within a factor of ten')
+    source = 'the scene' if recorded else 'no source'
+    return Prior(median, _FREE_SPREAD, f'{source}, within a factor of ten')
 
 
 def window_means(times: Floats, values: Floats) -> Floats:
@@ -153,7 +155,7 @@ class Linearised:
         """Variance of a residual, widened by the correlation of neighbours in time."""
         scale = _variance(self.residuals, len(self.names))
         for _ in range(_SCALE_ROUNDS):
-            step = self._step(scale)
+            step = self.step(scale=scale)
             left = [r - j @ step for r, j in zip(self.residuals, self.jacobians, strict=True)]
             scale = _variance(left, len(self.names))
         return scale
@@ -168,15 +170,14 @@ class Linearised:
         """Posterior covariance of the unknowns, shape (p, p)."""
         return np.asarray(np.linalg.inv(self.information + np.diag(self.prior_spread**-2.0)), float)
 
-    def step(self, weights: Floats | None = None) -> Floats:
+    def step(self, weights: Floats | None = None, scale: float = 0.0) -> Floats:
         """Return the Gauss-Newton step to the maximum of the posterior, shape (p,).
 
         Args:
             weights: how often each bag counts, shape (bags,); None: once.
+            scale: variance of a residual; 0: that of the problem.
         """
-        return self._step(self.scale, weights)
-
-    def _step(self, scale: float, weights: Floats | None = None) -> Floats:
+        scale = scale or self.scale
         counts = np.ones(len(self.residuals)) if weights is None else weights
         parts = list(zip(counts, self.jacobians, self.residuals, strict=True))
         matrix = sum(n * (j.T @ j) for n, j, _ in parts) / scale
@@ -185,7 +186,8 @@ class Linearised:
         pull = pull + precision * (self.prior_mean - self.at)
         return np.asarray(np.linalg.solve(matrix + np.diag(precision), pull), float)
 
-    def bootstrap_spread(self, seed: int = 0) -> Floats | None:
+    @cached_property
+    def bootstrap_spread(self) -> Floats | None:
         """Return standard deviations over bags drawn with replacement, shape (p,).
 
         They are those of a normal distribution with the same interval of 95 %: a rare draw without
@@ -194,7 +196,7 @@ class Linearised:
         bags = len(self.residuals)
         if bags < MIN_BOOTSTRAP_BAGS:
             return None
-        random = np.random.default_rng(seed)
+        random = np.random.default_rng(0)
         draws = random.multinomial(bags, np.full(bags, 1.0 / bags), RESAMPLES)
         steps = np.array([self.step(draw.astype(float)) for draw in draws])
         low, high = np.quantile(steps, [0.025, 0.975], axis=0)
@@ -208,16 +210,16 @@ class Linearised:
         forces and that of the mesh.
         """
         tail = 0.5 + self.confidence / 2.0
-        widths = np.sqrt(np.diag(self.covariance)) * student.ppf(tail, 1e6)
-        spread = self.bootstrap_spread()
+        widths = np.sqrt(np.diag(self.covariance)) * norm.ppf(tail)
+        spread = self.bootstrap_spread
         if spread is not None:
             widths = np.maximum(widths, spread * student.ppf(tail, len(self.residuals) - 1))
         common = FORCE_SPREAD * np.isin(self.names, _BY_FORCE)
         if self.mesh_change is not None:
             common = np.hypot(common, MESH_LEFT_SPREAD * self.mesh_change)
-        widths = np.hypot(widths, common * student.ppf(tail, 1e6))
+        widths = np.hypot(widths, common * norm.ppf(tail))
         # Bags that say nothing leave the prior, and no more than that.
-        return np.asarray(np.minimum(widths, self.prior_spread * student.ppf(tail, 1e6)))
+        return np.asarray(np.minimum(widths, self.prior_spread * norm.ppf(tail)))
 
     @cached_property
     def estimates(self) -> Floats:
@@ -255,7 +257,7 @@ class Estimate:
 
 def estimates_of(problem: Linearised, priors: Mapping[str, Prior]) -> dict[str, Estimate]:
     """Return each constant with its interval."""
-    spread = problem.bootstrap_spread()
+    spread = problem.bootstrap_spread
     found = {}
     for i, (name, at) in enumerate(zip(problem.names, problem.estimates, strict=True)):
         half = problem.half_widths[i]

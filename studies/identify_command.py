@@ -1,11 +1,9 @@
 """`trainer identify`: the material under which recorded hands would feel the recorded forces."""
 
 import json
-import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,11 +17,12 @@ from rich.table import Table
 
 from cutting_trainer.bags.errors import BagError
 from cutting_trainer.recordings.recorded_scene import restore_scene
+from cutting_trainer.recordings.resimulate_command import refuse_lost_changes
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
-from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.scene_overrides import load_changed, value_of
 from cutting_trainer.studies.bag_collection import StudyBag, find_bags
-from cutting_trainer.studies.designs import Setting
+from cutting_trainer.studies.designs import MESH_KEY, Setting
 from cutting_trainer.studies.evaluation import Job, read_recording
 from cutting_trainer.studies.fit import Fit, Floats, Observation, Point
 from cutting_trainer.studies.identification import (
@@ -37,7 +36,7 @@ from cutting_trainer.studies.identification import (
 from cutting_trainer.studies.identification_page import write_identification_page
 from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.refined_mesh import write_refined
-from cutting_trainer.studies.study_command import NO_DASK
+from cutting_trainer.studies.study_command import NO_DASK, without_nan, workers_of
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MATERIAL_FILE, RESULT_FILE = 'material.yaml', 'identification.json'
@@ -47,7 +46,6 @@ ON_RECORDED_MESH = 'the intervals are without the error of the mesh: --refine ad
 LOCKING = ('linear', 'corotational')
 """Models whose elements are too stiff where tissue hardly changes its volume."""
 _KEY = 'tissue.material'
-_MESH_KEY = 'tissue.mesh'
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class Identification:
         """Return the outcome for JSON."""
         return {
             'estimates': {
-                name: {**_plain(estimate), 'unit': PARAMETERS[name]}
+                name: {**without_nan(estimate), 'unit': PARAMETERS[name]}
                 for name, estimate in self.estimates.items()
             },
             'notes': self.sentences,
@@ -126,8 +124,10 @@ def run_identification(options: IdentifyOptions) -> Status:
         if name not in PARAMETERS:
             raise SessionError(f'--parameter {name}: there are {", ".join(PARAMETERS)}')
     bags = find_bags(options.bags, Path.cwd())
+    if options.output.exists() and not options.output.is_dir():
+        raise SessionError(f'{options.output} is a file: name a folder with --output')
     options.output.mkdir(parents=True, exist_ok=True)
-    with _workers(options) as client:
+    with workers_of(options) as client:
         found = identify(bags, options, client)
     preset = {name: _digits(e.value) for name, e in found.estimates.items()}
     (options.output / MATERIAL_FILE).write_text(
@@ -159,22 +159,26 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         options: of the command.
         client: of the workers.
     """
-    changes = {key: yaml.safe_load(value) for key, value in options.changes.items()}
-    if _MESH_KEY in changes:
-        changes[_MESH_KEY] = str(Path(changes[_MESH_KEY]).resolve())
-    observations = [_observe(bag) for bag in bags]
-    tissue = _tissue(bags[0], options.changes)
-    material = tissue.material
-    names = options.parameters or tuple(
+    keys = [*options.changes, *([MESH_KEY] if options.refine else [])]
+    observations = [_observe(bag, keys) for bag in bags]
+    tissues = [_tissue(bag, options.changes) for bag in bags]
+    tissue, material = tissues[0], tissues[0].material
+    changes = {key: value_of(key, text) for key, text in options.changes.items()}
+    names = tuple(dict.fromkeys(options.parameters)) or tuple(
         name for name in PARAMETERS if getattr(material, name) > 0.0
     )
     priors = {name: prior_of(name, getattr(material, name)) for name in names}
     with np.errstate(divide='ignore'):
         recorded = np.log([getattr(material, name) for name in names])
-    running = _Running(bags, names, changes, client)
+    running = _Running(bags, observations, names, changes, client)
     fit = Fit(observations, priors, options.noise, running.compute)
     problem = fit.solve(fit.start(recorded), CONFIDENCE)
     notes = [] if options.refine else [ON_RECORDED_MESH]
+    notes += [
+        f'{bag.name} has another tissue than {bags[0].name}: all get the constants of one'
+        for bag, other in zip(bags, tissues, strict=True)
+        if (other.model, other.material) != (tissue.model, material)
+    ]
     if tissue.model in LOCKING:
         notes.append(
             f'the force of the model {tissue.model} depends on the mesh: '
@@ -191,6 +195,13 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         fit = Fit(observations, priors, options.noise, again, fit.slopes)
         problem = fit.solve(coarse, CONFIDENCE)
         problem = replace(problem, mesh_change=problem.estimates - coarse)
+    forces = fit.forces(problem.at)
+    for bag, computed in zip(bags, forces, strict=True):
+        if np.isnan(computed).any():
+            raise SessionError(
+                f'{bag.name} cannot be computed with the constants that were found: '
+                f'{"; ".join(running.failures())}'
+            )
     return Identification(
         estimates=estimates_of(problem, priors),
         sentences=[*identifiability(problem), *notes, *running.failures()],
@@ -198,7 +209,7 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         cpu=running.cpu,
         problem=problem,
         observations=observations,
-        forces=fit.forces(problem.at),
+        forces=forces,
     )
 
 
@@ -208,12 +219,14 @@ class _Running:
     def __init__(
         self,
         bags: Sequence[StudyBag],
+        observations: Sequence[Observation],
         names: Sequence[str],
         changes: Mapping[str, Any],
         client: Any,
     ) -> None:
         self.computed, self.cpu = 0, 0.0
-        self._bags, self._names, self._changes, self._client = bags, names, changes, client
+        self._bags, self._observations, self._names = bags, observations, names
+        self._changes, self._client = changes, client
         self._reasons: dict[str, int] = {}
 
     def failures(self) -> list[str]:
@@ -237,7 +250,7 @@ class _Running:
         here, keys, jobs = identity_of_worker(), {}, []
         for number, key in enumerate(wanted, 1):
             bag, pairs = self._bags[key[0]], zip(self._names, key[1], strict=True)
-            mesh = {_MESH_KEY: meshes[key[0]]} if meshes else {}
+            mesh = {MESH_KEY: meshes[key[0]]} if meshes else {}
             material = {f'{_KEY}.{name}': value for name, value in pairs}
             setting = Setting(number, {**self._changes, **material, **mesh})
             keys[bag.hash, setting.identity] = key
@@ -247,43 +260,32 @@ class _Running:
             key = keys[job.bag_hash, job.setting.identity]
             self.computed += 1
             self.cpu += result.cpu
+            if result.lost:
+                raise SessionError(f'{self._bags[key[0]].name}: {result.failure}')
             if result.series is not None:
-                found[key] = result.series.vectors
+                found[key] = result.series
             else:
                 self._reasons[result.failure] = self._reasons.get(result.failure, 0) + 1
-                found[key] = np.full((_ticks(self._bags[key[0]]), 3), np.nan)
+                found[key] = np.full_like(self._observations[key[0]].felt, np.nan)
         return found
 
 
-def _ticks(bag: StudyBag) -> int:
-    return len(read_recording(str(bag.path), bag.hash).felt.times)
-
-
-def _observe(bag: StudyBag) -> Observation:
+def _observe(bag: StudyBag, keys: Sequence[str]) -> Observation:
+    """Return the recorded force of a bag, in which dotted keys of the scene can be changed."""
     try:
-        felt = read_recording(str(bag.path), bag.hash).felt
-    except BagError as error:
+        recording = read_recording(str(bag.path), bag.hash)
+        refuse_lost_changes(recording.beginning, keys)
+    except (BagError, SessionError) as error:
         raise BagError(f'{bag.name}: {error}') from None
+    felt = recording.felt
     return Observation((felt.times - felt.times[0]) * 1e-9, felt.vectors)
 
 
 def _tissue(bag: StudyBag, changes: Mapping[str, str]) -> TissueSettings:
     recording = read_recording(str(bag.path), bag.hash)
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
-        return load_scene(str(restore_scene(recording.bag, Path(temporary), changes))).tissue
-
-
-def _workers(options: IdentifyOptions) -> AbstractContextManager[Any]:
-    from cutting_trainer.studies.cluster import others_cluster, own_cluster
-
-    if options.scheduler:
-        return others_cluster(options.scheduler)
-    return own_cluster(options.workers or len(os.sched_getaffinity(0)))
-
-
-def _plain(estimate: Estimate) -> dict[str, object]:
-    values = asdict(estimate)
-    return {k: None if v != v else v for k, v in values.items()}
+        file = restore_scene(recording.bag, Path(temporary), changes)
+        return load_changed(file, changes).tissue
 
 
 def _digits(value: float) -> float:

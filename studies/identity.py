@@ -1,10 +1,12 @@
 """Identity of a worker: code, kernels, libraries, machine."""
 
+import hashlib
 from dataclasses import dataclass, fields
 from functools import cache
+from importlib.metadata import version
 
 from cutting_trainer.node_common.code_identity import hash_of_sources, identity_here
-from cutting_trainer.node_common.share_folder import ROOMS
+from cutting_trainer.node_common.share_folder import ROOMS, share_folder
 
 CODE = ('node_common', 'bags', 'session', 'recordings', 'studies')
 """Packages that decide the numbers of a row beside those with kernels."""
@@ -21,7 +23,8 @@ class Identity:
         commit: of the git repository; '' without one.
         code: hash of the sources of `CODE`.
         kernels: hash of the sources with kernels.
-        python, numba, llvmlite, numpy: versions.
+        devices: hash of the profiles of devices, which bound the force.
+        python, numba, llvmlite, numpy, scipy, meshio: versions.
         cpu: model name of the processor.
         target: processor by the name that LLVM gives it.
         features: instructions that kernels are compiled for, comma-separated.
@@ -37,6 +40,9 @@ class Identity:
     cpu: str
     target: str
     features: str
+    scipy: str = ''
+    meshio: str = ''
+    devices: str = ''
 
     def differences(self, worker: 'Identity') -> list[str]:
         """Return a sentence for each difference of code or libraries, not of the machine."""
@@ -69,4 +75,13 @@ def identity_of_worker() -> Identity:
         cpu=here.cpu,
         target=here.target,
         features=here.features,
+        scipy=version('scipy'),
+        meshio=version('meshio'),
+        devices=_hash_of_profiles(),
     )
+
+
+def _hash_of_profiles() -> str:
+    files = sorted((share_folder() / 'config' / 'devices').glob('*.yaml'))
+    text = b''.join(file.name.encode() + file.read_bytes() for file in files)
+    return hashlib.sha256(text).hexdigest()[:_HASH_DIGITS]

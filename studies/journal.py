@@ -32,12 +32,12 @@ class Journal:
     Attributes:
         path: the file.
         rows: results by key; those of other code are not among them.
-        outdated: rows in the file that other code has computed.
+        outdated: keys of rows that only other code has computed.
     """
 
     path: Path
     rows: dict[Key, Result]
-    outdated: int
+    outdated: set[Key]
     _descriptor: int
 
     def append(self, key: Key, result: Result) -> None:
@@ -85,14 +85,14 @@ def open_journal(folder: Path, here: Identity) -> Iterator[Journal]:
         if cut_off:
             file.truncate(len(whole) + 1 if whole else 0)
         rows: dict[Key, Result] = {}
-        outdated = 0
+        outdated: set[Key] = set()
         for number, line in enumerate(whole.splitlines(), start=1):
             key, result = _row(line, path, number)
             if here.differences(result.identity):
-                outdated += 1
+                outdated.add(key)
             else:
                 rows[key] = result
-        yield Journal(path, rows, outdated, file.fileno())
+        yield Journal(path, rows, outdated - rows.keys(), file.fileno())
 
 
 def _row(line: bytes, path: Path, number: int) -> tuple[Key, Result]:

@@ -4,12 +4,12 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.markup import escape
@@ -41,6 +41,18 @@ NO_DASK = (
     'a study needs Dask, which is not installed: `./trainer setup` installs it, and elsewhere '
     '`pip install "cutting_trainer[study]"`'
 )
+
+
+class WorkerOptions(Protocol):
+    """Options of a command about its workers."""
+
+    @property
+    def workers(self) -> int:
+        """Number of own workers; 0: one for each processor."""
+
+    @property
+    def scheduler(self) -> str:
+        """Address of a scheduler with workers; '': own workers."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +139,7 @@ def run_study(options: StudyOptions) -> Status:
     study = read_study(options.file)
     notes = Console(stderr=True, soft_wrap=True)
     bags = bags_of(study, options.file.resolve().parent, notes)
-    settings = [RECORDED, *settings_of(study.settings)]
+    settings = [RECORDED, *settings_of(study.settings, options.file.resolve().parent)]
     if not options.folder.parent.is_dir() or options.folder.is_file():
         raise SessionError(
             f'{options.folder} cannot be made: name a folder with --output in one that exists'
@@ -165,18 +177,21 @@ def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
     """Compute the rest of a study; return False where it was interrupted."""
     jobs = plan.jobs()
     done = plan.size - len(jobs)
-    if plan.journal.outdated:
+    wanted = {key_of(job.bag_hash, job.setting) for job in jobs}
+    if outdated := len(plan.journal.outdated & wanted):
         notes.print(
-            f'{plan.journal.outdated} rows of {options.folder} are of other code or libraries, and '
+            f'{outdated} rows of {escape(str(options.folder))} are of other code or libraries, and '
             'are computed again',
             highlight=False,
         )
     if not jobs:
         return True
+    from cutting_trainer.studies.cluster import compute
+
     if done:
         notes.print(f'{done} of {plan.size} rows are done already', highlight=False)
     try:
-        with _workers(options, len(jobs)) as client, _progress(notes) as bar:
+        with workers_of(options, len(jobs)) as client, _progress(notes) as bar:
             threads = sum(client.nthreads().values())
             notes.print(
                 f'{len(plan.bags)} bags, {len(plan.settings) - 1} settings, {threads} workers; '
@@ -186,7 +201,7 @@ def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
             task = bar.add_task('rows', total=plan.size, completed=done, failed='')
             save = _saving(lambda: _write_tables(options.folder, plan))
             failed = 0
-            for job, result in _computed(client, jobs):
+            for job, result in compute(client, jobs):
                 plan.take(job, result)
                 failed += bool(result.failure)
                 bar.update(task, advance=1, failed=f'{failed} failed' if failed else '')
@@ -196,18 +211,21 @@ def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
     return True
 
 
-def _workers(options: StudyOptions, most: int) -> AbstractContextManager[Any]:
+def workers_of(options: WorkerOptions, most: int = 1024) -> AbstractContextManager[Any]:
+    """Return a client of the workers that options ask for, no more own ones than `most`.
+
+    Raises:
+        SessionError: there is no scheduler, or both kinds of workers are asked for.
+    """
     from cutting_trainer.studies.cluster import others_cluster, own_cluster
 
+    if options.scheduler and options.workers:
+        raise SessionError(
+            '--workers starts own workers, and --scheduler has those of others: give one of them'
+        )
     if options.scheduler:
         return others_cluster(options.scheduler)
     return own_cluster(min(options.workers or len(os.sched_getaffinity(0)), most))
-
-
-def _computed(client: Any, jobs: list[Job]) -> Iterator[tuple[Job, Result]]:
-    from cutting_trainer.studies.cluster import compute
-
-    return compute(client, jobs)
 
 
 def _progress(notes: Console) -> Progress:
@@ -239,8 +257,14 @@ def _saving(write: Callable[[], None]) -> Callable[[], None]:
 
 def _write_tables(folder: Path, plan: Plan) -> None:
     rows = plan.rows()
-    write_table(folder / TABLE_FILE, rows, plan.study.outputs)
-    write_costs(folder / COSTS_FILE, rows)
+    try:
+        write_table(folder / TABLE_FILE, rows, plan.study.outputs)
+        write_costs(folder / COSTS_FILE, rows)
+    except OSError as error:
+        raise SessionError(
+            f'{folder} cannot take the tables ({error}): make room, and start the study again; it '
+            'goes on with what is left'
+        ) from None
 
 
 def _tell(options: StudyOptions, plan: Plan, rows: list[Row], summary: StudySummary) -> None:
@@ -253,8 +277,8 @@ def _tell(options: StudyOptions, plan: Plan, rows: list[Row], summary: StudySumm
             'rows': len(rows),
             'planned': plan.size,
             'failures': summary.failures,
-            'effects': [_plain(effect) for effect in summary.settings],
-            'effects_of_keys': [_plain(effect) for effect in summary.keys],
+            'effects': [without_nan(effect) for effect in summary.settings],
+            'effects_of_keys': [without_nan(effect) for effect in summary.keys],
             'notes': summary.notes,
         }
         json.dump(report, sys.stdout, indent=2)
@@ -266,6 +290,6 @@ def _tell(options: StudyOptions, plan: Plan, rows: list[Row], summary: StudySumm
         console.print(f'wrote {escape(file)}', highlight=False)
 
 
-def _plain(effect: Any) -> dict[str, object]:
-    """Return an effect for JSON, which has no NaN."""
-    return {k: None if v != v else v for k, v in asdict(effect).items()}
+def without_nan(found: Any) -> dict[str, object]:
+    """Return a data class for JSON, which has no NaN."""
+    return {k: None if v != v else v for k, v in asdict(found).items()}

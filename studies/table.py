@@ -68,19 +68,20 @@ def write_table(file: Path, rows: Sequence[Row], outputs: Iterable[str]) -> None
     ]
     identities = [asdict(row.result.identity) for row in rows]
     for identity in identities:
-        del identity['commit']  # it changes with the documents, too
+        del identity['commit'], identity['cpu']  # of one kind of processor, there are many
     for name in identities[0] if identities else ():
         columns[name] = [identity[name] for identity in identities]
     _write(file, columns, types)
 
 
 def write_costs(file: Path, rows: Sequence[Row]) -> None:
-    """Write processor time [s], memory [bytes] and commit of each row, which vary."""
+    """Write processor time [s], memory [bytes], processor and commit of each row, which vary."""
     columns: dict[str, list[object]] = {
         **({name: [row.head[name] for row in rows] for name in rows[0].head} if rows else {}),
         'cpu': [row.result.cpu for row in rows],
         'warm_up': [row.result.warm_up for row in rows],
         'memory': [row.result.memory for row in rows],
+        'processor': [row.result.identity.cpu for row in rows],
         'commit': [row.result.identity.commit for row in rows],
     }
     _write(file, columns, {'setting': pa.int64(), 'cpu': pa.float64(), 'warm_up': pa.float64()})

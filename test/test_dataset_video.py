@@ -10,11 +10,12 @@ import pytest
 from PIL import Image
 
 from bench.files.lerobot_loader import differences, figures_of, same_pictures
+from cutting_trainer.bags.topic_names import POSE
 from cutting_trainer.recordings.film_command import open_film, write_video
 from cutting_trainer.recordings.headless_browser import CHROMIUM
 from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.studies import dataset_video
+from cutting_trainer.studies import dataset_episode, dataset_video
 from cutting_trainer.studies.bag_collection import StudyBag, find_bags
 from cutting_trainer.studies.dataset import INFO_FILE, write_dataset
 from cutting_trainer.studies.dataset_episode import ACTION, FORCES, STATE, Episode, read_episode
@@ -55,6 +56,22 @@ def test_a_picture_has_all_forces_since_the_one_before_and_the_next_pose_as_acti
     assert np.diff(frames.times) == pytest.approx(1 / FPS, abs=1e-6)
     with pytest.raises(SessionError, match=r'at 100 Hz make no pictures at 30 Hz.*without --video'):
         ticks.by_picture(30)
+
+
+def test_forces_keep_their_rate_where_poses_come_less_often(monkeypatch) -> None:
+    bag, whole = sample()
+    stream = dataset_episode._stream
+
+    def thinned(opened, topic: str, *about):
+        stamps, values, delay = stream(opened, topic, *about)
+        step = 10 if topic == POSE else 1
+        return stamps[::step], values[::step], delay
+
+    monkeypatch.setattr(dataset_episode, '_stream', thinned)
+    thin = read_episode(bag, SessionMetadata())
+    assert thin.rate == whole.rate and thin.length == whole.length
+    assert np.array_equal(thin.values[FORCES], whole.values[FORCES])
+    assert not np.array_equal(thin.values[STATE], whole.values[STATE])
 
 
 def test_a_video_with_other_pictures_than_were_drawn_is_refused(tmp_path: Path) -> None:

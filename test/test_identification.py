@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.resimulation_start import find_beginning
+from cutting_trainer.recordings.resimulate_command import refuse_lost_changes
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.studies import fit, identification
+from cutting_trainer.studies import cluster, fit, identification
+from cutting_trainer.studies.bag_collection import find_bags
+from cutting_trainer.studies.evaluation import Job, Result
 from cutting_trainer.studies.fit import Fit, Observation
 from cutting_trainer.studies.identification import (
     Linearised,
@@ -23,8 +28,13 @@ from cutting_trainer.studies.identification import (
     prior_of,
     window_means,
 )
-from cutting_trainer.studies.identify_command import IdentifyOptions, run_identification
+from cutting_trainer.studies.identify_command import (
+    IdentifyOptions,
+    identify,
+    run_identification,
+)
 from cutting_trainer.studies.refined_mesh import refine
+from cutting_trainer.tissue_sim.simulation.serialisation import ObjectState
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLES = ROOT / 'bags' / 'samples' / 'format_7'
@@ -259,6 +269,29 @@ def test_the_command_finds_the_modulus_of_a_palpation_and_says_that_nothing_was_
     assert any('do not touch toughness' in note for note in found['notes'])
     assert 'youngs_modulus' in (tmp_path / 'out' / 'material.yaml').read_text()
     assert 'data:image/png' in (tmp_path / 'out' / 'identification.html').read_text()
+
+
+def test_a_material_of_which_nothing_can_be_computed_is_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failed(client: object, jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
+        for job in jobs:
+            yield job, Result({}, 'the tissue has no rest', 0, job.identity, 0.0, 0.0, 0)
+
+    options = IdentifyOptions((str(SAMPLES / 'palpation'),), tmp_path, ('youngs_modulus',))
+    bags = find_bags(options.bags, tmp_path)
+    monkeypatch.setattr(cluster, 'compute', failed)
+    with pytest.raises(SessionError, match=r'cannot be computed with .* failed: the tissue has no'):
+        identify(bags, options, None)
+
+
+def test_a_mesh_cannot_be_changed_where_a_bag_begins_with_one() -> None:
+    beginning = find_beginning(open_bag(SAMPLES / 'palpation'))
+    refuse_lost_changes(beginning, ['tissue.mesh'])
+    later = replace(beginning, tissue=ObjectState('', b''))
+    refuse_lost_changes(later, ['tissue.model'])
+    with pytest.raises(SessionError, match=r'tissue\.mesh cannot be changed: the bag begins'):
+        refuse_lost_changes(later, ['tissue.model', 'tissue.mesh'])
 
 
 def test_a_constant_that_there_is_not_is_refused_before_anything_is_computed(

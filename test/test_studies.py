@@ -15,11 +15,12 @@ from cutting_trainer.exercises.attempt_store import AttemptRow
 from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.session.attempts import open_store
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.studies import evaluation
 from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find_bags, hash_of_bag
-from cutting_trainer.studies.description import Study, read_study
+from cutting_trainer.studies.description import Designs, Study, read_study
 from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings, interval
-from cutting_trainer.studies.evaluation import Result
+from cutting_trainer.studies.evaluation import Job, Result
 from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.journal import JOURNAL_FILE, Journal, key_of, open_journal
 from cutting_trainer.studies.outputs import OUTPUTS
@@ -68,6 +69,15 @@ BAD_EDITS = [
     ),
     ('word for a number', '[100, 200]', '[100, tough]', 4, ['tough', 'valid number']),
     ('unknown choice', '[combined, delete]', '[combined, delet]', 5, ['delet', "'delete'"]),
+    (
+        'range of whole numbers',
+        'tissue.material.toughness: {low: 50',
+        'tissue.integration.min_substeps: {low: 1',
+        9,
+        ['min_substeps', 'use a grid'],
+    ),
+    ('key in a list', 'cutting.method', 'tissue.regions.toughness', 5, ['give the whole list']),
+    ('mesh that is none', '[100, 200]', '[100, 200]\n    tissue.mesh: [3]', 5, ['is no path']),
     ('end of a range', 'high: 400', 'high: 1e7', 9, ['high', '100000']),
     ('no YAML', 'bags: [bags]', 'bags: [bags', 2, ['not valid YAML']),
 ]
@@ -118,6 +128,50 @@ def test_settings_are_those_of_all_designs_each_once(tmp_path: Path) -> None:
     assert Setting(7, turned).identity == settings[0].identity  # the order of keys is none
 
 
+def test_settings_with_other_names_for_one_value_are_one_and_meshes_count_by_content(
+    tmp_path: Path,
+) -> None:
+    assert Setting(1, {'a.b': 3}).identity == Setting(2, {'a.b': 3.0}).identity
+    design = {'grid': {'tissue.mesh': ['fine.vtk']}}
+    before, after = '', ''
+    for text in ('one', 'another'):
+        (tmp_path / 'fine.vtk').write_text(text)
+        (setting,) = settings_of(Designs.model_validate(design), tmp_path)
+        before, after = after, setting.identity
+    assert setting.changes['tissue.mesh'] == str(tmp_path / 'fine.vtk')
+    assert before != after
+
+
+def test_keys_that_share_their_last_word_are_told_apart() -> None:
+    settings = [
+        Setting(1 + 2 * i + k, {'haptics.rate': x, 'tissue.rate': y, 'a.b': x * y})
+        for i, x in enumerate((1, 2))
+        for k, y in enumerate((3, 5))
+    ]
+    assert settings[0].label == 'haptics.rate=1, tissue.rate=3, b=3'
+    rows = made_rows(3, settings, np.array([[0, 10, 12, 11, 13]] * 3))
+    found, _ = effects_of_keys(rows, ['largest_force'], 0.95)
+    assert {e.cause: e.mean for e in found if 'rate' in e.cause} == pytest.approx(
+        {'haptics.rate 1 -> 2': 1.0, 'tissue.rate 3 -> 5': 2.0}
+    )
+
+
+def test_one_key_has_an_effect_of_its_own() -> None:
+    settings = [Setting(1, {'a.b': 1}), Setting(2, {'a.b': 2})]
+    rows = made_rows(2, settings, np.array([[0, 5, 8]] * 2))
+    found, _ = effects_of_keys(rows, ['largest_force'], 0.95)
+    assert [(effect.cause, effect.mean) for effect in found] == [('b 1 -> 2', 3.0)]
+
+
+def test_a_bag_out_of_reach_is_no_row(monkeypatch) -> None:
+    monkeypatch.setattr(evaluation, 'warm_up', lambda: None)
+    job = Job('/nowhere', '0', RECORDED, identity_of_worker())
+    gone = evaluation.evaluate(job)
+    assert gone.lost and gone.failure.startswith('/nowhere is not there on this worker')
+    monkeypatch.setattr(evaluation, 'read_recording', lambda *_: [][1])
+    assert not evaluation.evaluate(job).lost
+
+
 def test_hypercube_has_one_sample_in_each_part_of_a_range_and_sobol_too(tmp_path: Path) -> None:
     text = GOOD.replace('samples: 5', 'samples: 16\n    seed: 3')
     for design in ('latin_hypercube', 'sobol'):
@@ -139,6 +193,10 @@ def test_bags_are_found_below_folders_and_by_globs_each_content_once(tmp_path: P
     for pattern, said in (('x*', 'no file matches'), ('aa', 'does not exist'), ('.git', 'exist')):
         with pytest.raises(SessionError, match=said):
             find_bags([pattern], tmp_path)
+    for name, sample in (('cut[1]', 'palpation'), ('cut1', 'straight_cut')):
+        shutil.copytree(SAMPLES / sample, tmp_path / name)
+    (named,) = find_bags(['cut[1]'], tmp_path)  # a name, though it is a pattern, too
+    assert named.name == 'cut[1]'
     (tmp_path / 'empty').mkdir()
     with pytest.raises(SessionError, match='there is no bag in it'):
         find_bags(['empty'], tmp_path)
@@ -205,7 +263,11 @@ def test_rows_are_read_back_and_those_of_other_code_or_cut_off_are_not(tmp_path:
     file.write_bytes(whole + whole.splitlines()[0][:-9])
     with open_journal(tmp_path, here) as journal:
         assert journal.rows == {('b', ''): elsewhere, ('b', setting.identity): kept}
-        assert journal.outdated == 1
+        assert journal.outdated == {('a', '')}
+        journal.append(key_of('a', RECORDED), kept)
+    whole = file.read_bytes()
+    with open_journal(tmp_path, here) as journal:
+        assert not journal.outdated  # a row has been computed again
     assert file.read_bytes() == whole
     file.write_text('{"key": 3}\n')
     with (
@@ -217,7 +279,7 @@ def test_rows_are_read_back_and_those_of_other_code_or_cut_off_are_not(tmp_path:
 
 def test_full_disk_gives_one_sentence() -> None:
     full = os.open('/dev/full', os.O_WRONLY)
-    journal = Journal(Path('rows.jsonl'), {}, 0, full)
+    journal = Journal(Path('rows.jsonl'), {}, set(), full)
     with pytest.raises(SessionError, match=r'No space left on device\): make room'):
         journal.append(('a', ''), result(1.0))
     os.close(full)
@@ -244,7 +306,8 @@ def test_table_has_a_type_for_each_key_and_the_same_bytes_each_time(tmp_path: Pa
     assert read['a.word'] == [None, 'x', 'true'] and read['a.list'] == [None, '[1]', None]
     assert read['largest_force'] == [0.0, 1.0, None]
     assert read['failure'] == ['', '', 'it diverged']
-    assert {'cpu', 'kernels', 'code', 'numpy'} <= read.keys()
+    assert {'target', 'kernels', 'code', 'numpy', 'devices'} <= read.keys()
+    assert 'cpu' not in read  # two models of one kind of processor compute the same bits
     write_table(tmp_path / 'none.parquet', [], ['largest_force'])  # before the first row
 
 

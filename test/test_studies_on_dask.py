@@ -275,31 +275,28 @@ def test_scheduler_that_does_not_answer_is_named() -> None:
         pass
 
 
-def test_worker_of_others_with_several_threads_is_refused(client: Client) -> None:
+def test_workers_of_others_are_taken(client: Client) -> None:
     with others_cluster(client.scheduler.address) as another:
         assert another.nthreads() == client.nthreads()
-    with (
-        LocalCluster(**IN_PROCESS, threads_per_worker=2) as cluster,
-        pytest.raises(SessionError, match='has 2 threads: start workers with --nthreads 1'),
-        others_cluster(cluster.scheduler_address),
-    ):
-        pass
 
 
 @pytest.mark.parametrize(
-    ('dask', 'found', 'said'),
+    ('dask', 'threads', 'found', 'said'),
     [
-        ('1', replace(identity_of_worker(), code='0'), 'other code: code is 0 on the worker'),
-        ('1', ModuleNotFoundError('no cutting_trainer'), 'cannot import the trainer.*: start it'),
-        ('2', identity_of_worker(), 'tcp://w has dask 2, and here is 1: install the same'),
+        ('1', 1, replace(identity_of_worker(), code='0'), 'other code: code is 0 on the worker'),
+        ('1', 1, ModuleNotFoundError('no cutting_trainer'), 'cannot import the trainer.*: start'),
+        ('2', 1, identity_of_worker(), 'tcp://w has dask 2, and here is 1: install the same'),
+        ('1', 2, identity_of_worker(), 'tcp://w has 2 threads: start workers with --nthreads 1'),
     ],
 )
-def test_worker_of_others_with_other_code_is_refused(dask: str, found: object, said: str) -> None:
+def test_worker_of_others_that_would_compute_otherwise_is_refused(
+    dask: str, threads: int, found: object, said: str
+) -> None:
     mine, theirs = ({'packages': {'dask': d, 'distributed': '1'}} for d in ('1', dask))
     versions = {'client': mine, 'scheduler': mine, 'workers': {'tcp://w': theirs}}
     world: Any = SimpleNamespace(
         get_versions=lambda: versions,
-        nthreads=lambda: {'tcp://w': 1},
+        nthreads=lambda: {'tcp://w': threads},
         run=lambda function, on_error: {'tcp://w': found},
     )
     with pytest.raises(SessionError, match=said):
