@@ -7,6 +7,7 @@ import numpy as np
 from cutting_trainer.cutting.geometry import EDGE_NODES, height, orientation
 from cutting_trainer.cutting.lookup import base_of, edge_key, edge_slot, is_on_cut
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import cross, dot
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 _EXACT = 1e-6
@@ -55,11 +56,15 @@ def surfaces(corners: np.ndarray) -> np.ndarray:
 def _normals(triangles):
     """Return unit normals of triangles (k, 3, 3), and twice their areas [m^2]."""
     normals = np.empty((len(triangles), 3))
-    sizes = np.empty(len(triangles))
+    sizes, one, other = np.empty(len(triangles)), np.empty(3), np.empty(3)
     for k in range(len(triangles)):
-        n = np.cross(triangles[k, 1] - triangles[k, 0], triangles[k, 2] - triangles[k, 0])
-        sizes[k] = np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
-        normals[k] = n / max(sizes[k], _MIN_NORMAL)
+        for c in range(3):
+            one[c] = triangles[k, 1, c] - triangles[k, 0, c]
+            other[c] = triangles[k, 2, c] - triangles[k, 0, c]
+        cross(one, other, normals[k])
+        sizes[k] = np.sqrt(dot(normals[k], normals[k]))
+        for c in range(3):
+            normals[k, c] /= max(sizes[k], _MIN_NORMAL)
     return normals, sizes
 
 
@@ -116,11 +121,14 @@ def _in_reach(triangles, normals, sizes, slack, positions, corners):
 
 @inner
 def _box(triangles, slack):
-    """Return the lower and upper corner of a sweep's bounding box [m], shape (2, 3)."""
+    """Return the lower and upper corner of the bounding box of triangles [m], shape (2, 3)."""
     box = np.empty((2, 3))
-    for i in range(3):
-        box[0, i] = triangles[:, :, i].min() - slack
-        box[1, i] = triangles[:, :, i].max() + slack
+    for c in range(3):
+        low, high = np.inf, -np.inf
+        for k in range(len(triangles)):
+            for i in range(3):
+                low, high = min(low, triangles[k, i, c]), max(high, triangles[k, i, c])
+        box[0, c], box[1, c] = low - slack, high + slack
     return box
 
 
@@ -192,9 +200,9 @@ def met_tetrahedra(triangles, links, positions, near_nodes, everywhere, seen, ma
         Shape (t,).
     """
     normals, sizes = _normals(triangles)
-    slack = 0.0
-    for i in range(3):
-        slack = max(slack, 1e-6 * (triangles[:, :, i].max() - triangles[:, :, i].min()))
+    slack, box = 0.0, _box(triangles, 0.0)
+    for c in range(3):
+        slack = max(slack, 1e-6 * (box[1, c] - box[0, c]))
     tetrahedra, first_corner, corner_next = links.tetrahedra, links.first_corner, links.corner_next
     queue = [np.int64(0) for _ in range(0)]
     if everywhere:
@@ -238,7 +246,10 @@ def find_hits(triangles, links, tables, positions, met):
     base = np.empty(4, np.int64)
     x = np.empty(3)
     normals, sizes = _normals(triangles)
-    extents = np.array([np.ptp(triangles[0]), np.ptp(triangles[1])])
+    extents = np.empty(2)
+    for k in range(2):
+        box = _box(triangles[k : k + 1], 0.0)
+        extents[k] = max(box[1, 0], box[1, 1], box[1, 2]) - min(box[0, 0], box[0, 1], box[0, 2])
     tetrahedra, origin, owner = links.tetrahedra, tables.origin, tables.owner
     parent_nodes, hash_key = tables.parent_nodes, tables.hash_key
     row, side, state = tables.node_row, tables.node_side, tables.node_state

@@ -8,6 +8,7 @@ from cutting_trainer.cutting.geometry import orientation
 from cutting_trainer.cutting.lookup import SNAPPED, is_on_cut, on_cut_bits, origin_of
 from cutting_trainer.cutting.subdivision_cases import FRONT, LABEL_FACES
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import cross, norm
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 
@@ -271,8 +272,11 @@ def split_nodes(patch, concerned, rest, new_rest):
 @inner
 def _face_area(x, face):
     a, b, c = x[FACE_NODES[face, 0]], x[FACE_NODES[face, 1]], x[FACE_NODES[face, 2]]
-    n = np.cross(b - a, c - a)
-    return 0.5 * np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+    one, other, normal = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        one[i], other[i] = b[i] - a[i], c[i] - a[i]
+    cross(one, other, normal)
+    return 0.5 * norm(normal)
 
 
 @inner

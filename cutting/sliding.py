@@ -5,6 +5,7 @@ import numpy as np
 from cutting_trainer.cutting.geometry import altitude, height
 from cutting_trainer.cutting.lookup import SNAPPED, base_of
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import dot
 from cutting_trainer.tissue_sim.mesh.topology import CUT, FACE_NODES
 
 _MIN_ALTITUDE_LEFT = 0.4
@@ -189,18 +190,13 @@ def _surface_normals(node, links, rest, at, where):
 
 
 @inner
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@inner
 def _keeps_shape(way, normals, shape):
     """Return whether a sliding node leaves the surface by at most `shape` [m], and an earlier cut
     only by rounding.
     """
-    length = np.sqrt(_dot(way, way))
+    length = np.sqrt(dot(way, way))
     for k in range(len(normals)):
-        off = abs(_dot(normals[k], way))
+        off = abs(dot(normals[k], way))
         if off > _FLAT * length and (normals[k, 3] > 0.0 or off > shape):
             return False
     return True
@@ -213,8 +209,8 @@ def _along(direction, plane, least, way):
     Return whether it is not too oblique, and the direction longer than `least`: a shorter one is
     rounding.
     """
-    size = np.sqrt(_dot(direction, direction))
-    rise = _dot(plane, direction)
+    size = np.sqrt(dot(direction, direction))
+    rise = dot(plane, direction)
     if abs(rise) <= _MAX_INCLINATION * size or size <= least:
         return False
     for i in range(3):
@@ -257,27 +253,27 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
     turn = np.empty(3)
     for k in range(len(normals)):
         for j in range(k):
-            if _dot(normals[k], normals[j]) < -0.9:
+            if dot(normals[k], normals[j]) < -0.9:
                 return False
         a, b = normals[0], normals[k]
         turn[0] = a[1] * b[2] - a[2] * b[1]
         turn[1] = a[2] * b[0] - a[0] * b[2]
         turn[2] = a[0] * b[1] - a[1] * b[0]
-        if _dot(turn, turn) > sharpest:
-            sharpest = _dot(turn, turn)
+        if dot(turn, turn) > sharpest:
+            sharpest = dot(turn, turn)
             across[0], across[1], across[2] = turn[0], turn[1], turn[2]
     inward, tangent = np.empty(3), np.empty(3)
     _volume_gradient(star, rest, at, where, inward)
     if normals[:, 3].min() == 2.0:  # within the tissue, where volume does not change
         for i in range(3):
             inward[i] = -normals[:, i].sum()
-    size = np.sqrt(_dot(inward, inward))
-    share = _dot(inward, plane) / max(size * size, 1e-300)
+    size = np.sqrt(dot(inward, inward))
+    share = dot(inward, plane) / max(size * size, 1e-300)
     smooth = True
     for i in range(3):
         tangent[i] = plane[i] - share * inward[i]
     for k in range(len(normals)):
-        smooth &= _dot(normals[k], inward) < -_SMOOTH * size
+        smooth &= dot(normals[k], inward) < -_SMOOTH * size
     if (
         smooth
         and _along(tangent, plane, _MAX_INCLINATION, way)
@@ -333,8 +329,6 @@ def can_slide(star, plane, links, tables, rest, fixed, shape, floor):
 def _express(node, target, links, rest, nodes, weights):
     """Compute nodes and weights for a place, in the tetrahedron at a node that contains it or is
     nearest.
-
-    Return whether it is in or near one.
 
     Returns:
         Whether it is in or near the cone of one.

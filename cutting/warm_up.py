@@ -10,11 +10,20 @@ from cutting_trainer.cutting.parting import Surface, part_along
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.state_table import block, put_on_cut
 from cutting_trainer.tissue_sim.contact.blade import Sweep
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
 from cutting_trainer.tissue_sim.warm_up import small_cube
+
+_MANY_EDGES = 1 << 12
+"""More than an empty table has room for: it is made anew."""
 
 
 def warm_up(settings: CuttingSettings) -> None:
+    """Cut a cube with the method of some settings, and part another."""
+    warm_up_method(settings)
+    warm_up_parting()
+
+
+def warm_up_method(settings: CuttingSettings) -> None:
     """Move a blade through a cube with the method of some settings."""
     mesh = small_cube()
     method = make_method(settings)
@@ -25,9 +34,9 @@ def warm_up(settings: CuttingSettings) -> None:
         if not result.delta.empty:
             mesh.apply(result.delta)
     method.finish(mesh, mesh.rest)
-    _part(small_cube())
     # Of elements that are too flat to be divided or would be inside out: the cube has none.
-    tables = with_room(empty_tables(), mesh_nodes=1, tetrahedra=1, nodes=1, edges=1, parents=1)
+    room = {'mesh_nodes': 1, 'tetrahedra': 1, 'nodes': 1, 'edges': _MANY_EDGES, 'parents': 1}
+    tables = with_room(empty_tables(), **room)
     put_on_cut(tables, 0, np.zeros(0, np.int64), mesh.rest)
     block(tables, 0, np.zeros(0, np.int64))
     ends = np.int64(0), np.int64(1)
@@ -35,8 +44,9 @@ def warm_up(settings: CuttingSettings) -> None:
     edge_key(*ends)
 
 
-def _part(mesh: TetMesh) -> None:
+def warm_up_parting() -> None:
     """Part a cube along its middle, as strokes do that leave tissue between them."""
+    mesh = small_cube()
     size, middle = float(np.ptp(mesh.rest)), mesh.rest.mean(axis=0)
     share = np.linspace(-0.6, 0.6, 13)
     points = middle + size * np.stack(np.meshgrid(0.0, share, share), axis=-1).reshape(-1, 3)

@@ -4,6 +4,7 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge import extrapolation, safety
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.vectors import norm
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
 _SCALPEL = ToolMode.SCALPEL.value
@@ -30,10 +31,10 @@ def enter(setup: np.ndarray, state: np.ndarray, time: int, out: np.ndarray) -> N
     c, s = setup[0], state[0]
     if s.mode != _SCALPEL:
         return
-    if s.entered == 0 and safety.norm(out) >= max(c.entry_force, s.borne):
+    if s.entered == 0 and norm(out) >= max(c.entry_force, s.borne):
         s.entered = time
     if s.entered != 0:
-        safety.clamp(c.blade_friction * safety.norm(s.proxy - s.tip), out)
+        safety.clamp(c.blade_friction * norm(s.proxy - s.tip), out)
 
 
 @inner
@@ -114,14 +115,14 @@ def _go_on(
         force: of that length [N], shape (3,).
     """
     c, s, h = setup[0], state[0], history[0]
-    size, limit = safety.norm(force), _largest_force(setup, state, history, length, force)
+    size, limit = norm(force), _largest_force(setup, state, history, length, force)
     if size <= limit or length == 0.0:
         return False
     scale, stiffness = extrapolation.rendered_share(h.stiffness, c.max_stiffness), 0.0
     for k in range(3):
         for j in range(3):
             stiffness += scale * force[k] * h.stiffness[k, j] * force[j] / size**2
-    if stiffness <= _MIN_SHARE * scale * np.sqrt(np.sum(h.stiffness**2)):
+    if stiffness <= _MIN_SHARE * scale * extrapolation.size_of(h.stiffness):
         return False
     drop, step = size - limit, min(stiffness * c.crack_length, limit - c.blade_friction * length)
     if step > 0.0:
@@ -188,7 +189,7 @@ def _largest_force(
     a sample has a larger force, spine or flat bear it. Against the spine nothing is cut.
     """
     c, s, h = setup[0], state[0], history[0]
-    most, shown, towards = s.resistance, safety.norm(h.force[1]), 0.0
+    most, shown, towards = s.resistance, norm(h.force[1]), 0.0
     for k in range(3):
         towards -= force[k] * s.facing[k]
     if h.leaving > 0.0:
@@ -209,7 +210,7 @@ def _largest_force(
 @inner
 def _cosine(force: np.ndarray, axis: np.ndarray) -> float:
     """Return the cosine of the angle between a force and the edge; 0 where there is none."""
-    along, size = 0.0, safety.norm(force) * safety.norm(axis)
+    along, size = 0.0, norm(force) * norm(axis)
     for k in range(3):
         along += force[k] * axis[k]
     return min(max(along / size, -1.0), 1.0) if size > 0.0 else 0.0

@@ -10,6 +10,7 @@ import numpy as np
 from cutting_trainer.haptic_bridge.proxy.coupling_spring import surface_stiffness
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import cross, dot
 
 CONSTANT, TIME, POSITION, LOCAL_STIFFNESS = range(4)
 LAWS = {
@@ -128,8 +129,18 @@ def rendered_share(stiffness: np.ndarray, max_stiffness: float) -> float:
         stiffness: [N/m], shape (3, 3).
         max_stiffness: that norm [N/m].
     """
-    norm = np.sqrt(np.sum(stiffness * stiffness))
-    return max_stiffness / norm if norm > max_stiffness else 1.0
+    size = size_of(stiffness)
+    return max_stiffness / size if size > max_stiffness else 1.0
+
+
+@inner
+def size_of(stiffness: np.ndarray) -> float:
+    """Return the Frobenius norm of a stiffness, shape (3, 3)."""
+    square = 0.0
+    for i in range(3):
+        for j in range(3):
+            square += stiffness[i, j] * stiffness[i, j]
+    return np.sqrt(square)
 
 
 @inner
@@ -161,12 +172,13 @@ def local_blade(
     h = history[0]
     scale = rendered_share(h.stiffness, max_stiffness)
     mean, square = h.immersed[0], h.immersed[1]
-    before, now = h.arms[0] - h.arms[1], arms[0] - arms[1]
-    length = before[0] ** 2 + before[1] ** 2 + before[2] ** 2
-    moved, first, moment = np.empty(3), np.empty(3), np.zeros(3)
-    if length > 0.0:
-        moment = np.cross(h.torque[1], before) / length
+    before, now, moment = np.empty(3), np.empty(3), np.empty(3)
     for k in range(3):
+        before[k], now[k] = h.arms[0, k] - h.arms[1, k], arms[0, k] - arms[1, k]
+    length, moved, first = dot(before, before), np.empty(3), np.empty(3)
+    cross(h.torque[1], before, moment)
+    for k in range(3):
+        moment[k] = moment[k] / length if length > 0.0 else 0.0
         way, turned = position[k] - h.position[1, k], now[k] - before[k]
         there = arms[1, k] - h.arms[1, k]
         moved[k] = way + (there + mean * turned)
@@ -178,7 +190,7 @@ def local_blade(
             spread += h.stiffness[k, j] * first[j]
         out[k] = h.force[1, k] - scale * pull
         moment[k] -= scale * spread
-    torque[:] = np.cross(now, moment)
+    cross(now, moment, torque)
 
 
 @inner

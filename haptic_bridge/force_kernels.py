@@ -17,6 +17,7 @@ from cutting_trainer.haptic_bridge.scene_schema import (
     ToolSettings,
 )
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import norm
 from cutting_trainer.tissue_sim.contact.blade_constants import UNKNOWN_BLADE, BladeConstants
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 
@@ -208,7 +209,7 @@ def _add_turn(before: np.ndarray, after: np.ndarray, turned: np.ndarray) -> None
     axis[0] = b[3] * a[0] - a[3] * b[0] + b[1] * a[2] - b[2] * a[1]
     axis[1] = b[3] * a[1] - a[3] * b[1] + b[2] * a[0] - b[0] * a[2]
     axis[2] = b[3] * a[2] - a[3] * b[2] + b[0] * a[1] - b[1] * a[0]
-    sine = safety.norm(axis)
+    sine = norm(axis)
     if sine == 0.0:
         return
     angle = 2.0 * np.arctan2(sine, abs(cosine))
@@ -323,7 +324,7 @@ def _tissue_force(
         if outward < 0.0:
             out[:] = 0.0
         # Bounded by the force that this depth of the coupling spring and the known stiffness allow.
-        safety.clamp(s.known * safety.norm(s.proxy - s.tip) + c.slack, out)
+        safety.clamp(s.known * norm(s.proxy - s.tip) + c.slack, out)
         if s.stick[0].sliding_friction > 0.0:
             _add_friction(setup, state, history, out)
         blade_force.enter(setup, state, time, out)
@@ -351,7 +352,7 @@ def _add_friction(
         stiffness = surface_stiffness(h.stiffness, c.coupling)
     friction.drag(s.stick, s.tip, n, pushed, min(stiffness, c.max_stiffness))
     # The contact's force is that of the spring, whose normal part may differ from the one felt.
-    share = safety.norm(s.external) / pushed if pushed > 0.0 else 0.0
+    share = norm(s.external) / pushed if pushed > 0.0 else 0.0
     for k in range(3):
         out[k] = pushed * n[k] + stick.force[k]
         s.external[k] -= share * stick.force[k]
@@ -361,7 +362,7 @@ def _add_friction(
 def _follow_edge(setup: np.ndarray, state: np.ndarray) -> None:
     """Raise the bound of the blade's force by the stretch of its spring since the last tick."""
     s = state[0]
-    stretch = max(safety.norm(s.blade[0] - s.edge[0]), safety.norm(s.blade[1] - s.edge[1]))
+    stretch = max(norm(s.blade[0] - s.edge[0]), norm(s.blade[1] - s.edge[1]))
     s.held += setup[0].coupling * stretch
     for end in range(2):
         for k in range(3):
@@ -416,7 +417,7 @@ def command(
     # The torque goes from zero to its largest in the time in which the force does.
     step = c.max_slew * elapsed * c.max_torque / c.max_force
     safety.settle(s.torque, step, c.max_torque, gain, turning)
-    finite = np.isfinite(safety.norm(force) + safety.norm(turning))
+    finite = np.isfinite(norm(force) + norm(turning))
     for k in range(3):
         s.force[k] = force[k] if finite else 0.0
         s.torque[k] = turning[k] if finite else 0.0

@@ -18,6 +18,7 @@ from cutting_trainer.haptic_bridge.force_kernels import (
 from cutting_trainer.haptic_bridge.proxy import step
 from cutting_trainer.haptic_bridge.proxy.surface import Geometry
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import norm
 
 MIN_PERIOD_S = 1e-4
 """[s] Shortest period of a tick for velocities and the slew limit."""
@@ -120,7 +121,7 @@ def tick(
     finite = command(setup, state, history, s.contact, enabled, time, gain, elapsed)
     if s.contact != NONE:
         s.contact_time += elapsed
-    s.max_norm = max(s.max_norm, safety.norm(s.force))
+    s.max_norm = max(s.max_norm, norm(s.force))
     pack(state, proxy, used, time, max(revision, 0), topology, enabled, report)
     return s.contact, finite
 
@@ -164,7 +165,7 @@ def _stay_inside(
         # The samples of the cut stay: the change of state has already voided the older ones.
         s.stretch[:] = 0.0
         step.detach(proxy, s.stick)
-        s.held = safety.norm(s.force) / c.force_scale + c.slack
+        s.held = norm(s.force) / c.force_scale + c.slack
         s.contact = INSIDE
     edge = work[0].edge
     for end in range(2):

@@ -13,6 +13,7 @@ The latch of E-STOP is in `node_common/operating_state.py`.
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.vectors import norm
 
 OK, NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE, JUMP, ROTATION_JUMP = range(6)
 POSE_FAULTS = {
@@ -34,12 +35,6 @@ NOMINAL_PERIOD_S = 1e-3
 """[s] Shortest period assumed between two poses: stamps may be closer than the motion took."""
 MIN_WINDOW_S = 0.008
 """[s] Window over which the whole motion is checked too: jitter of stamps averages out there."""
-
-
-@inner
-def norm(v: np.ndarray) -> float:
-    """Return |v| of shape (3,); NaN where a component is."""
-    return np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
 @inner
@@ -150,7 +145,9 @@ def control(
     """
     if energy >= 0.0:
         return 0.0
-    squared = np.sum(velocity * velocity)
+    squared = 0.0
+    for k in range(len(velocity)):
+        squared += velocity[k] * velocity[k]
     damping = max_damping
     if squared * period * max_damping > -energy:
         damping = -energy / (squared * period)

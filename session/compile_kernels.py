@@ -65,9 +65,16 @@ def warm_up_tissue() -> None:
 def warm_up_cutting(**settings: Any) -> None:
     """Cut with settings of the scene's section `cutting`."""
     from cutting_trainer.cutting.scene_schema import CuttingSettings
-    from cutting_trainer.cutting.warm_up import warm_up
+    from cutting_trainer.cutting.warm_up import warm_up_method
 
-    warm_up(CuttingSettings(**settings))
+    warm_up_method(CuttingSettings(**settings))
+
+
+def warm_up_parting() -> None:
+    """Part what strokes leave between them."""
+    from cutting_trainer.cutting.warm_up import warm_up_parting
+
+    warm_up_parting()
 
 
 def warm_up_haptics() -> None:
@@ -127,6 +134,7 @@ DEMO: dict[str, Callable[[], None]] = {
     'tissue': warm_up_tissue,
     'cutting': warm_up_cutting,
     'force loop': warm_up_haptics,
+    'parting': warm_up_parting,
     'emulated arm': warm_up_arm,
 }
 FURTHER: dict[str, Callable[[], None]] = {

@@ -20,7 +20,13 @@ from cutting_trainer.tissue_sim.planner.memory import recall, remember
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
 from cutting_trainer.tissue_sim.scene_schema import ActiveRegionSettings, TissueSettings
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
-from cutting_trainer.tissue_sim.warm_up import warm_up, warm_up_method, warm_up_models
+from cutting_trainer.tissue_sim.warm_up import (
+    warm_up,
+    warm_up_far_field,
+    warm_up_method,
+    warm_up_models,
+    warm_up_viscosity,
+)
 
 
 def load_tissue(
@@ -163,6 +169,10 @@ def make_simulation(
     found = make_plan(task, note, note) if settings.method == 'auto' else None
     taken = as_planned(settings, found)
     warm_up_method(taken.integrator)
+    if taken.active_region.mode == 'budget':
+        warm_up_far_field()
+    if taken.material.prony:
+        warm_up_viscosity()
     simulation = TissueSimulation(
         mesh or task.mesh,
         task.material,

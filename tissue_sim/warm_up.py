@@ -32,12 +32,17 @@ from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 _FRAMES = 40
 _MATERIAL = Material(1000.0, 0.4, 1000.0, 10.0, 5e-4)
+_STEPPING = TimeStepping('symplectic_euler')
 
 
 def warm_up() -> None:
-    """Run every model and integrator; move a tool through a cube, and remove an element."""
+    """Run every model and integrator, far fields and viscosity; move a tool through a cube, and
+    remove an element.
+    """
     for integrator in INTEGRATORS:
         warm_up_method(integrator)
+    warm_up_far_field()
+    warm_up_viscosity()
 
 
 def warm_up_method(integrator: IntegratorName) -> None:
@@ -45,7 +50,7 @@ def warm_up_method(integrator: IntegratorName) -> None:
 
     The kernels of all models come first, and in the same order for all integrators: of a kernel
     inlined in several others, a process runs the copy loaded first, and copies may differ in the
-    last bit. A fixed order makes results reproducible.
+    last bit. A fixed order makes results reproducible. Those that few scenes need come last.
     """
     warm_up_models()
     warm_up_frames(integrator)
@@ -97,21 +102,37 @@ def warm_up_frames(integrator: IntegratorName) -> None:
 @cache
 def warm_up_models() -> None:
     """Move a cube with every model. Only the first call does anything."""
-    region, stepping = ActiveSettings('budget', 6), TimeStepping('symplectic_euler')
+    _move_every_model(ActiveSettings())
+    # Further kernels, for a large tissue or one after many cuts.
+    cube, n = small_cube(), 8
+    nodes, free = np.array([1]), np.ones(3 * n, bool)
+    for model in ('linear', 'stiffening'):
+        tissue = ElasticModel(cube, _MATERIAL, model)
+        PointCompliance(most=4).estimate(tissue, free, nodes, np.ones(1), np.eye(3))
+    rows = TensorMass(cube, 1.0, 1.0).tensors
+    packed(rows.start, rows.used, rows.room, n, rows.columns, rows.blocks, np.array([1 << 20]))
+
+
+@cache
+def warm_up_far_field() -> None:
+    """Move a cube with a far field by every model. Only the first call does anything."""
+    _move_every_model(ActiveSettings('budget', 6))
+
+
+@cache
+def warm_up_viscosity() -> None:
+    """Move a viscous cube. Only the first call does anything."""
+    viscous = replace(_MATERIAL, prony=((0.5, 1.0),))
+    Dynamics(small_cube(), viscous, 'stiffening', _STEPPING).advance(Coupling())
+
+
+def _move_every_model(active: ActiveSettings) -> None:
     top = np.full(3, 0.01)
     touching = Coupling(PUSH, np.array([7]), np.ones(1), top, top, stiffness=1.0)
     for model in MODELS:
-        cube = Dynamics(small_cube(), _MATERIAL, model, stepping, region)
+        cube = Dynamics(small_cube(), _MATERIAL, model, _STEPPING, active)
         for coupling in (Coupling(), touching, Coupling()):
             cube.advance(coupling)
-    viscous = replace(_MATERIAL, prony=((0.5, 1.0),))
-    Dynamics(small_cube(), viscous, 'stiffening', stepping).advance(Coupling())
-    # Further kernels, for a large tissue or one after many cuts.
-    tissue, n = ElasticModel(small_cube(), _MATERIAL, 'linear'), 8
-    nodes, free = np.array([1]), np.ones(3 * n, bool)
-    PointCompliance(most=4).estimate(tissue, free, nodes, np.ones(1), np.eye(3))
-    rows = TensorMass(tissue.mesh, 1.0, 1.0).tensors
-    packed(rows.start, rows.used, rows.room, n, rows.columns, rows.blocks, np.array([1 << 20]))
 
 
 def small_cube() -> TetMesh:

@@ -11,10 +11,10 @@ The sphere rests over that point, not over the tip. Its depth there gives the no
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy.half_spaces import norm
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.haptic_bridge.proxy.surface import Geometry
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import norm
 from cutting_trainer.tissue_sim.contact.friction import Friction
 
 STICK = record_type(

@@ -9,6 +9,7 @@ import numpy as np
 
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import assign
 
 MAX_HALF_SPACES = 64
 """Half-spaces."""
@@ -30,21 +31,6 @@ _OPPOSED = 1e-12
 """Squared sine of the angle of planes, facing each other, that count as a gap without an end."""
 _SOFTNESS = 1e-9
 """Weight of the goal against the half-spaces where these contradict each other."""
-
-
-@inner
-def norm(v: np.ndarray) -> float:
-    """Return the length of v, shape (3,)."""
-    return np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-
-
-@inner
-def assign(target: np.ndarray, values: np.ndarray) -> None:
-    """Copy values, shape (3,).
-
-    `target[:] = values` takes Numba seconds to compile: it may have to tell that shapes differ.
-    """
-    target[0], target[1], target[2] = values[0], values[1], values[2]
 
 
 @kernel

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy.half_spaces import norm
 from cutting_trainer.haptic_bridge.proxy.surface import Geometry
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.vectors import norm
 
 TIE_TOLERANCE_M = 1e-9
 """[m] Difference of distances below which triangles count as equally near."""
@@ -70,9 +70,10 @@ def _on_rim(surface: Geometry, ties: int, near: np.ndarray) -> bool:
     """Return whether the closest point is on an edge of only one triangle."""
     w = near[0]
     weights = w.weights[:, w.order[0]]
-    if weights.min() > 0.0:
+    a, b, c = weights[0], weights[1], weights[2]
+    if min(a, b, c) > 0.0:
         return False
-    if weights.max() < 1.0:
+    if max(a, b, c) < 1.0:
         return ties == 1
     for i in range(ties):
         for j in range(3):

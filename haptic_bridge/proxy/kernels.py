@@ -16,6 +16,7 @@ from cutting_trainer.haptic_bridge.proxy.neighbourhood import (
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.haptic_bridge.proxy.surface import Geometry
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.vectors import assign, norm
 
 PATCHES = 3
 """Triangles that a contact reports."""
@@ -115,7 +116,7 @@ def _leap(surface: Geometry, blend: float, ahead: float, radius: float, state: n
             for axis in range(3):
                 s.position[axis] += part * (s.goal[axis] - s.position[axis])
             return False
-    half_spaces.assign(s.position, s.goal)
+    assign(s.position, s.goal)
     return True
 
 
@@ -132,12 +133,12 @@ def _advance(radius: float, state: np.ndarray) -> int:
     if not spaces.feasible:
         _squeeze(radius, state)
     free = y[0] == s.step[0] and y[1] == s.step[1] and y[2] == s.step[2]
-    still = half_spaces.norm(y) <= _MIN_STEP_M
+    still = norm(y) <= _MIN_STEP_M
     part = _part_to_rim(max(near.reach - radius, 1e-3 * radius), state)
     for axis in range(3):
         s.position[axis] += part * y[axis]
     if free and part == 1.0:
-        half_spaces.assign(s.position, s.goal)
+        assign(s.position, s.goal)
     refresh(s.position, s.near)
     if part < 1.0:
         return AT_RIM
@@ -152,7 +153,7 @@ def _squeeze(radius: float, state: np.ndarray) -> None:
     half_spaces.compromise(s.spaces)
     y, gap = spaces.optimum, near.distance[near.order[0]]
     # Shorter than the gap, so that no triangle can be crossed; none where there was room.
-    scale = min(1.0, 0.5 * gap / max(half_spaces.norm(y), 1e-300))
+    scale = min(1.0, 0.5 * gap / max(norm(y), 1e-300))
     if gap >= radius - _TOLERANCE_M and half_spaces.worst(s.spaces, y) > _TOLERANCE_M:
         scale = 0.0
     for axis in range(3):
@@ -218,7 +219,7 @@ def leave_tissue(surface: Geometry, blend: float, radius: float, state: np.ndarr
     nearest = near.order[0]
     for axis in range(3):
         s.position[axis] = near.closest[axis, nearest] + _EXIT_HEIGHT * radius * s.step[axis]
-    half_spaces.assign(s.goal, s.position)
+    assign(s.goal, s.position)
     seek(surface, blend, 0.0, radius, radius, state)
     return True
 

@@ -6,10 +6,10 @@ triangles.
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy.half_spaces import assign
 from cutting_trainer.haptic_bridge.proxy.record_type import record_type
 from cutting_trainer.haptic_bridge.proxy.surface import LEAF_SIZE, Geometry
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import assign
 
 CAPACITY = 256
 """Largest number of triangles kept; of more, the farthest are dropped and the reach shrinks."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cutting_trainer.haptic_bridge.proxy import friction, half_spaces
+from cutting_trainer.haptic_bridge.proxy import friction
 from cutting_trainer.haptic_bridge.proxy.kernels import (
     GATHER_MARGIN,
     distance,
@@ -12,6 +12,7 @@ from cutting_trainer.haptic_bridge.proxy.kernels import (
 )
 from cutting_trainer.haptic_bridge.proxy.surface import Geometry
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import assign
 
 ANOTHER, SAME, NEXT = range(3)
 """A surface in relation to that of the last step: one that has nothing to do with it, the same one,
@@ -78,7 +79,7 @@ def move(
     if not s.touching:
         friction.release(stick)
     elif not stays or grip.sliding:
-        half_spaces.assign(grip.anchor, s.position)
+        assign(grip.anchor, s.position)
         grip.placed = True
 
 
@@ -104,14 +105,14 @@ def _follow_device(
     """Move the proxy towards the device [m], shape (3,), and write its contact."""
     s = state[0]
     if not s.placed:
-        half_spaces.assign(s.position, device)
-        half_spaces.assign(s.device, device)
+        assign(s.position, device)
+        assign(s.device, device)
         s.nodes[:] = -1
         s.placed = True
         leave_tissue(surface, blend, radius, state)
     stride = 2.0 * distance(device, s.device)
-    half_spaces.assign(s.device, device)
-    half_spaces.assign(s.goal, device)
+    assign(s.device, device)
+    assign(s.goal, device)
     seek(surface, blend, min(stride, 2.0 * radius), GATHER_MARGIN * radius, radius, state)
     s.depth = distance(device, s.position)
     report(surface, blend, radius, state)
@@ -133,5 +134,5 @@ def _carry(
         if motion / steps >= s.clearance and leave_tissue(surface, blend, radius, state):
             continue
         if i < steps or wanted > 1:
-            half_spaces.assign(s.goal, s.position)
+            assign(s.goal, s.position)
             seek(surface, blend, 0.0, GATHER_MARGIN * radius, radius, state)

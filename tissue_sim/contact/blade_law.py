@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import cross, differences, dot, sum_of
 from cutting_trainer.tissue_sim.contact.crack import (
     borne_share,
     bound_run,
@@ -19,7 +20,6 @@ from cutting_trainer.tissue_sim.contact.facing import (
     Held,
     Law,
     across,
-    dot,
     hold,
     settled,
     to_edge,
@@ -111,8 +111,8 @@ def follow_device(edge, strips, device, moved, tissue, law):
     immerse(edge, device, tissue)
     paid, rubbed, swept, limit = 0.0, 0.0, 0.0, -1.0
     facing = across(law.facing, direction)
-    if not edge.spans.any():
-        strips.counts[:], edge.running[:] = 0, 0.0
+    if sum_of(edge.spans) == 0.0:
+        strips.counts[0], strips.counts[1], edge.running[0], edge.running[1] = 0, 0, 0.0, 0.0
         return no_pull()
     law = _law_now(law, rest_length(edge, tissue))
     low, high = _box(edge, device)
@@ -130,40 +130,50 @@ def follow_device(edge, strips, device, moved, tissue, law):
         after = edge.points.copy()
         immerse(edge, device, tissue)
         shares_inside(edge, tissue, points, after, spans, shares)
-        cut = (shares * costs[:, 0]).sum()
+        cut = _shared(shares, costs, 0)
         if law.crack > 0.0:
             cut *= note_run(edge, points, places, tissue, fresh)
-        paid, rubbed = paid + cut, rubbed + (shares * costs[:, 1]).sum()
-        swept += (shares * costs[:, 2]).sum()
-        if not edge.spans.any():
+        paid, rubbed = paid + cut, rubbed + _shared(shares, costs, 1)
+        swept += _shared(shares, costs, 2)
+        if sum_of(edge.spans) == 0.0:
             break
-    ways, arms = device - edge.points, SHARES * (POINTS * piece)
-    middle = (edge.spans * arms).sum() / max(edge.spans.sum(), TINY)
+    ways, arms = differences(device, edge.points), np.empty((POINTS, 1))
+    for i in range(POINTS):
+        arms[i, 0] = SHARES[i] * (POINTS * piece)
+    middle = _shared(edge.spans, arms, 0) / max(sum_of(edge.spans), TINY)
     if limit < 0.0:
         _resist(edge, ways.copy(), faces, blade, law, fresh, limits)
     half = next_tooth(edge, ways, fresh, limits, piece, law).half
     held = hold(edge, ways, blade, law, limits)
-    limit, torque_limit = limits.sum() + half, (limits * arms).sum() + half * middle
+    limit, torque_limit = sum_of(limits) + half, _shared(limits, arms, 0) + half * middle
     most = limits.copy()
     # As it is pulled now, or will be if the device moves on.
     _resist(edge, moved.copy(), faces, blade, law, fresh, limits)
     half = next_tooth(edge, moved, fresh, limits, piece, law).half
     hold(edge, ways, blade, law, limits)
-    limit = max(limit, limits.sum() + half)
-    torque_limit = max(torque_limit, (limits * arms).sum() + half * middle)
-    most = np.maximum(most, limits)
-    most *= limit / max(most.sum(), TINY)
-    force, torque, forces = np.zeros(3), np.zeros(3), np.zeros((POINTS, 3))
+    limit = max(limit, sum_of(limits) + half)
+    torque_limit = max(torque_limit, _shared(limits, arms, 0) + half * middle)
     for i in range(POINTS):
-        pull = law.stiffness * edge.spans[i] * ways[i]
+        most[i] = max(most[i], limits[i])
+    scale = limit / max(sum_of(most), TINY)
+    force, torque, forces = np.zeros(3), np.zeros(3), np.zeros((POINTS, 3))
+    arm, pull, turn = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(POINTS):
+        most[i] *= scale
         back = dot(ways[i], facing)
-        if back < 0.0:
-            pull += edge.spans[i] * settled(-back, piece, law) * facing
-        force += pull
-        forces[i] = pull
-        torque += np.cross(arms[i] * direction, pull)
+        held_back = settled(-back, piece, law) if back < 0.0 else 0.0
+        for c in range(3):
+            pull[c] = law.stiffness * edge.spans[i] * ways[i, c]
+            if back < 0.0:
+                pull[c] += edge.spans[i] * held_back * facing[c]
+            force[c] += pull[c]
+            forces[i, c] = pull[c]
+            arm[c] = arms[i, 0] * direction[c]
+        cross(arm, pull, turn)
+        for c in range(3):
+            torque[c] += turn[c]
     line, mean = _line(edge.spans, ways)
-    lag = np.sqrt((mean**2).sum())
+    lag = np.sqrt(dot(mean, mean))
     return Pull(
         force, torque, limit, torque_limit, line, lag, paid, rubbed, swept, held, forces, most
     )
@@ -249,6 +259,15 @@ def gather_loads(edge, loads):
 
 
 @inner
+def _shared(shares, values, column):
+    """Return the sum of a column of values, shape (n, k), each times its share."""
+    total = 0.0
+    for i in range(len(shares)):
+        total += shares[i] * values[i, column]
+    return total
+
+
+@inner
 def _law_now(law, longer):
     """Return the law with toughness by area now, where the edge is longer at rest by a factor."""
     toughness = longer * law.toughness
@@ -267,17 +286,22 @@ def _law_now(law, longer):
 @inner
 def _split(way, direction):
     """Return the lengths of a way along a direction and across it [m]."""
-    along = dot(way, direction)
-    across = way - along * direction
-    return abs(along), np.sqrt(dot(across, across))
+    along, square = dot(way, direction), 0.0
+    for c in range(3):
+        square += (way[c] - along * direction[c]) ** 2
+    return abs(along), np.sqrt(square)
 
 
 @inner
 def _direction(device):
     """Return the unit vector from tip to root, and the length that a point stands for [m]."""
-    edge = device[POINTS - 1] - device[0]
+    edge = np.empty(3)
+    for c in range(3):
+        edge[c] = device[POINTS - 1, c] - device[0, c]
     length = np.sqrt(dot(edge, edge))
-    return edge / length, length / (POINTS - 1)
+    for c in range(3):
+        edge[c] /= length
+    return edge, length / (POINTS - 1)
 
 
 @inner
@@ -289,17 +313,21 @@ def _box(edge, device):
             for c in range(3):
                 x, y = edge.points[i, c], device[i, c]
                 low[c], high[c] = min(low[c], min(x, y)), max(high[c], max(x, y))
-    return low - BLADE_THICKNESS, high + BLADE_THICKNESS
+    for c in range(3):
+        low[c], high[c] = low[c] - BLADE_THICKNESS, high[c] + BLADE_THICKNESS
+    return low, high
 
 
 @inner
 def _knots(edge, device):
     """Return some points of the edge, half a piece more at its ends [m], shape (KNOTS, 3)."""
-    knots, half = np.empty((KNOTS, 3)), (device[1] - device[0]) / 2
-    for k in range(KNOTS):
-        knots[k] = edge.points[_KNOTS[k]]
-    knots[0] -= half
-    knots[KNOTS - 1] += half
+    knots = np.empty((KNOTS, 3))
+    for c in range(3):
+        for k in range(KNOTS):
+            knots[k, c] = edge.points[_KNOTS[k], c]
+        half = (device[1, c] - device[0, c]) / 2
+        knots[0, c] -= half
+        knots[KNOTS - 1, c] += half
     return knots
 
 
@@ -318,7 +346,7 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits, costs):
     Returns:
         The largest force that the edge transmits as it is pulled [N], -1 where a point slipped.
     """
-    slid, ways = np.zeros(POINTS), device - edge.points
+    slid, ways = np.zeros(POINTS), differences(device, edge.points)
     _resist(edge, ways, faces, blade, law, fresh, limits)
     cutting, share = False, 1.0
     if law.crack > 0.0:
@@ -331,10 +359,11 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits, costs):
         slid[i] = max(size - borne / (law.stiffness * edge.spans[i]), 0.0)
         if not fresh[i]:
             slid[i] = min(slid[i], _MAX_FREE_SLIP)
-        ways[i] *= slid[i] / size
+        for c in range(3):
+            ways[i, c] *= slid[i] / size
         cutting = cutting or (fresh[i] and slid[i] > SETTLED)
     if slid.max() < SETTLED:
-        return limits.sum()
+        return sum_of(limits)
     if law.crack > 0.0:
         bound_run(edge, slid, ways, fresh)
     knots = _knots(edge, device)
@@ -343,7 +372,8 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits, costs):
         if edge.spans[i] > 0.0:
             rub = law.friction[edge.region[i]] * blade.piece * edge.spans[i] * slid[i]
             costs[i, 0], costs[i, 1] = limits[i] * slid[i] - rub, rub
-            edge.points[i] += ways[i]
+            for c in range(3):
+                edge.points[i, c] += ways[i, c]
             if fresh[i]:
                 area = blade.piece * edge.spans[i] * _split(ways[i], blade.direction)[1]
                 costs[i, 2] = area
@@ -373,11 +403,11 @@ def _resist(edge, ways, faces, blade, law, fresh, limits):
         limits: output, forces [N], shape (POINTS,).
     """
     e0, e1, e2 = blade.direction[0], blade.direction[1], blade.direction[2]
-    one_sided = blade.facing.any()
+    one_sided = dot(blade.facing, blade.facing) > 0.0
     at_tip = 0.0
     tip = law.at_tip[edge.region[0]]
     if tip > 0.0 and edge.spans[0] > 0.0 and _is_tip_fresh(edge, blade, faces):
-        at_tip = tip / edge.spans.sum()
+        at_tip = tip / sum_of(edge.spans)
     for i in range(POINTS):
         fresh[i], limits[i], blade.shares[i] = False, 0.0, 0.0
         if edge.spans[i] == 0.0:
@@ -399,8 +429,9 @@ def _resist(edge, ways, faces, blade, law, fresh, limits):
 def _is_tip_fresh(edge, blade, faces):
     """Return whether uncut tissue is ahead of the tip, beyond the half piece that strips have."""
     before, way = np.empty((1, 3)), np.empty((1, 3))
-    before[0] = edge.points[0] - (blade.piece / 2 + _BEYOND) * blade.direction
-    way[0] = -blade.direction
+    for c in range(3):
+        before[0, c] = edge.points[0, c] - (blade.piece / 2 + _BEYOND) * blade.direction[c]
+        way[0, c] = -blade.direction[c]
     return look_ahead(before, way, 0, faces)
 
 
@@ -418,23 +449,23 @@ def _line(spans, values):
         a and b, shape (2, 3), and the mean, shape (3,).
     """
     count, mean, middle = 0, np.zeros(3), 0.0
+    line, square = np.zeros((2, 3)), 0.0
     for i in range(POINTS):
         if spans[i] > 0.0:
             count += 1
             middle += SHARES[i]
-            mean += values[i]
-    line = np.zeros((2, 3))
+            for c in range(3):
+                mean[c] += values[i, c]
     if count == 0:
         return line, mean
-    middle, mean = middle / count, mean / count
-    line[0] = mean
-    if count < _MIN_POINTS:
-        return line, mean
-    along, square = np.zeros(3), 0.0
+    middle /= count
     for i in range(POINTS):
         if spans[i] > 0.0:
-            along += (SHARES[i] - middle) * values[i]
             square += (SHARES[i] - middle) ** 2
-    line[1] = along / square
-    line[0] -= middle * line[1]
+            for c in range(3):
+                line[1, c] += (SHARES[i] - middle) * values[i, c]
+    for c in range(3):
+        mean[c] /= count
+        line[1, c] = line[1, c] / square if count >= _MIN_POINTS else 0.0
+        line[0, c] = mean[c] - middle * line[1, c]
     return line, mean

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
-from cutting_trainer.tissue_sim.contact.facing import dot
+from cutting_trainer.node_common.vectors import dot
 from cutting_trainer.tissue_sim.contact.immersion import SETTLED
 
 _STAYS = 1e9

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.vectors import dot
 
 TINY = 1e-300
 """Divisor that is no length, where these are 0."""
@@ -62,11 +63,13 @@ class Held(NamedTuple):
 @inner
 def across(facing, direction):
     """Return the unit vector across a direction nearest to a facing; zero: there is none."""
-    part = facing - dot(facing, direction) * direction
+    part, along = np.empty(3), dot(facing, direction)
+    for c in range(3):
+        part[c] = facing[c] - along * direction[c]
     size = np.sqrt(dot(part, part))
-    if size < _MIN_ACROSS:
-        return np.zeros(3)
-    return part / size
+    for c in range(3):
+        part[c] = part[c] / size if size >= _MIN_ACROSS else 0.0
+    return part
 
 
 @inner
@@ -144,9 +147,3 @@ def to_edge(way, blade):
         left += (way[c] - after) ** 2
         way[c] = after
     return np.sqrt(left / max(whole, TINY))
-
-
-@inner
-def dot(a, b):
-    """Return the scalar product of two vectors."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

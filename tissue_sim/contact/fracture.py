@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.vectors import put
 
 BLADE_THICKNESS = 4e-4
 """Of a scalpel's blade [m]. Up to half of it away from a cut, the blade is still in that cut."""
@@ -92,13 +93,15 @@ def add_strip(strips, before, after):
     knots, counts = strips
     count = counts[0]
     if counts[1] and _path_length(knots[count - 1, 0], after) < _MAX_STRIP:
-        knots[count - 1, 1] = after
+        put(after, knots[count - 1, 1])
         return
     if count == MAX_STRIPS:
         for k in range(count - 1):
-            knots[k] = knots[k + 1]
+            for side in range(2):
+                put(knots[k + 1, side], knots[k, side])
         count -= 1
-    knots[count, 0], knots[count, 1] = before, after
+    put(before, knots[count, 0])
+    put(after, knots[count, 1])
     counts[0], counts[1] = count + 1, 1
 
 
@@ -131,7 +134,8 @@ def faces_near(positions, opened, strips, low, high, direction):
     count = 0
     for k in range(len(opened)):
         for i in range(3):
-            found[count, i] = positions[opened[k, i]]
+            for c in range(3):
+                found[count, i, c] = positions[opened[k, i], c]
         if _meets(found[count], low, high):
             count += 1
     for half in range(2):
@@ -208,7 +212,8 @@ def _write_planes(triangles, planes, k):
     n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
     size = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
     if size < 1e-14:
-        planes[k] = 0.0
+        for row in range(3):
+            _write_plane(planes, k, row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         planes[k, 0, 3] = np.inf
         return
     n0, n1, n2 = n0 / size, n1 / size, n2 / size

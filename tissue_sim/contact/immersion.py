@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
-from cutting_trainer.tissue_sim.contact.facing import dot
+from cutting_trainer.node_common.vectors import differences, dot, put, sum_of
 from cutting_trainer.tissue_sim.contact.fracture import BLADE_THICKNESS
 from cutting_trainer.tissue_sim.mesh.locate import locate_points
 
@@ -145,7 +145,7 @@ def rest_length(edge, tissue):
             continue
         if i + 1 < POINTS and edge.spans[i + 1] > 0.0:
             continue
-        length = edge.spans[first : i + 1].sum()
+        length = sum_of(edge.spans[first : i + 1])
         at_rest = apart = 0.0
         for c in range(3):
             way = 0.0
@@ -174,7 +174,7 @@ def lag_behind(edge, device):
         while ahead < POINTS and edge.spans[ahead] == 0.0:
             ahead += 1
         if last < 0 and ahead == POINTS:
-            points[:] = device
+            put(device, points)
             return
         first, second = last if last >= 0 else ahead, ahead if ahead < POINTS else last
         part = 0.0
@@ -210,17 +210,20 @@ def _enter(edge, i, tissue, tet):
 @inner
 def _go_to_tissue(edge, device, tissue, found):
     """Move an edge in the air to where it meets tissue on its way to the device's."""
-    ways, longest = device - edge.points, 0.0
+    ways, longest = differences(device, edge.points), 0.0
     for i in range(POINTS):
         longest = max(longest, dot(ways[i], ways[i]))
     steps = min(int(np.ceil(np.sqrt(longest) / (BLADE_THICKNESS / 2))), _MAX_STEPS)
     for step in range(1, steps + 1):
-        edge.points[:] = device - (1.0 - step / steps) * ways
+        for i in range(POINTS):
+            for c in range(3):
+                edge.points[i, c] = device[i, c] - (1.0 - step / steps) * ways[i, c]
         _locate(tissue, edge.points, edge.hint[0], found, edge.weights)
-        if (found >= 0).any():
-            return
+        for i in range(POINTS):
+            if found[i] >= 0:
+                return
     if steps == 0:
-        edge.points[:] = device
+        put(device, edge.points)
         _locate(tissue, edge.points, edge.hint[0], found, edge.weights)
 
 
@@ -232,8 +235,9 @@ def _measure_spans(edge, device, tissue):
     of a piece as the blade goes in.
     """
     beyond, found = np.empty((_TESTS, 3)), np.empty(_TESTS, np.int64)
-    weights, piece = np.empty((_TESTS, 4)), device[1] - device[0]
-    inside = edge.spans > 0.0
+    weights, inside = np.empty((_TESTS, 4)), np.empty(POINTS, np.bool_)
+    for i in range(POINTS):
+        inside[i] = edge.spans[i] > 0.0
     for i in range(POINTS):
         for step in (-1, 1):
             beside = i + step
@@ -241,7 +245,8 @@ def _measure_spans(edge, device, tissue):
                 continue
             for k in range(_TESTS):
                 for c in range(3):
-                    beyond[k, c] = edge.points[i, c] + step * (k + 1) / _TESTS * piece[c]
+                    piece = device[1, c] - device[0, c]
+                    beyond[k, c] = edge.points[i, c] + step * (k + 1) / _TESTS * piece
             _locate(tissue, beyond, edge.hint[0], found, weights)
             reached = 0
             while reached < _TESTS and found[reached] >= 0:
@@ -265,11 +270,17 @@ def _relax(edge, device, tissue, before):
         had = before[i] if before[i] > 0.0 else 0.5
         if edge.spans[i] <= had:
             continue
-        stretch = device[i] - edge.points[i]
-        if np.abs(stretch).max() <= SETTLED:
+        share, longest = 1.0 - np.sqrt(had / edge.spans[i]), 0.0
+        for c in range(3):
+            stretch = device[i, c] - edge.points[i, c]
+            longest = max(longest, abs(stretch))
+            one[0, c] = edge.points[i, c] + share * stretch
+        if longest <= SETTLED:
             continue
-        one[0] = edge.points[i] + (1.0 - np.sqrt(had / edge.spans[i])) * stretch
         _locate(tissue, one, edge.hint[0], found, weights)
         if found[0] >= 0:
-            edge.points[i], edge.weights[i] = one[0], weights[0]
+            for c in range(3):
+                edge.points[i, c] = one[0, c]
+            for k in range(4):
+                edge.weights[i, k] = weights[0, k]
             _enter(edge, i, tissue, found[0])

@@ -3,6 +3,7 @@
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import dot
 
 _INSIDE = -1e-9
 _MAX_WALK = 24
@@ -264,11 +265,11 @@ def _closest(point, positions, triangles):
 def _squared_distance(p, a, b, c):
     """Return the squared distance to a triangle, by Voronoi regions (Ericson 2005, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = _dot(ab, ap), _dot(ac, ap)
+    d1, d2 = dot(ab, ap), dot(ac, ap)
     bp = p - b
-    d3, d4 = _dot(ab, bp), _dot(ac, bp)
+    d3, d4 = dot(ab, bp), dot(ac, bp)
     cp = p - c
-    d5, d6 = _dot(ab, cp), _dot(ac, cp)
+    d5, d6 = dot(ab, cp), dot(ac, cp)
     vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
     if d1 <= 0.0 and d2 <= 0.0:
         nearest = a
@@ -285,9 +286,4 @@ def _squared_distance(p, a, b, c):
     else:
         nearest = a + ab * (vb / (va + vb + vc)) + ac * (vc / (va + vb + vc))
     away = p - nearest
-    return _dot(away, away)
-
-
-@inner
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return dot(away, away)
