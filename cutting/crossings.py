@@ -7,7 +7,7 @@ import numpy as np
 from cutting_trainer.cutting.geometry import EDGE_NODES, height, orientation
 from cutting_trainer.cutting.lookup import base_of, edge_key, edge_slot, is_on_cut
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.node_common.vectors import cross, dot
+from cutting_trainer.node_common.vectors import cross, norm
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 _EXACT = 1e-6
@@ -62,7 +62,7 @@ def _normals(triangles):
             one[c] = triangles[k, 1, c] - triangles[k, 0, c]
             other[c] = triangles[k, 2, c] - triangles[k, 0, c]
         cross(one, other, normals[k])
-        sizes[k] = np.sqrt(dot(normals[k], normals[k]))
+        sizes[k] = norm(normals[k])
         for c in range(3):
             normals[k, c] /= max(sizes[k], _MIN_NORMAL)
     return normals, sizes

@@ -5,7 +5,7 @@ import numpy as np
 from cutting_trainer.cutting.geometry import altitude, height
 from cutting_trainer.cutting.lookup import SNAPPED, base_of
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.node_common.vectors import dot
+from cutting_trainer.node_common.vectors import cross, dot, norm
 from cutting_trainer.tissue_sim.mesh.topology import CUT, FACE_NODES
 
 _MIN_ALTITUDE_LEFT = 0.4
@@ -194,7 +194,7 @@ def _keeps_shape(way, normals, shape):
     """Return whether a sliding node leaves the surface by at most `shape` [m], and an earlier cut
     only by rounding.
     """
-    length = np.sqrt(dot(way, way))
+    length = norm(way)
     for k in range(len(normals)):
         off = abs(dot(normals[k], way))
         if off > _FLAT * length and (normals[k, 3] > 0.0 or off > shape):
@@ -209,7 +209,7 @@ def _along(direction, plane, least, way):
     Return whether it is not too oblique, and the direction longer than `least`: a shorter one is
     rounding.
     """
-    size = np.sqrt(dot(direction, direction))
+    size = norm(direction)
     rise = dot(plane, direction)
     if abs(rise) <= _MAX_INCLINATION * size or size <= least:
         return False
@@ -256,9 +256,7 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
             if dot(normals[k], normals[j]) < -0.9:
                 return False
         a, b = normals[0], normals[k]
-        turn[0] = a[1] * b[2] - a[2] * b[1]
-        turn[1] = a[2] * b[0] - a[0] * b[2]
-        turn[2] = a[0] * b[1] - a[1] * b[0]
+        cross(a, b, turn)
         if dot(turn, turn) > sharpest:
             sharpest = dot(turn, turn)
             across[0], across[1], across[2] = turn[0], turn[1], turn[2]
@@ -267,7 +265,7 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
     if normals[:, 3].min() == 2.0:  # within the tissue, where volume does not change
         for i in range(3):
             inward[i] = -normals[:, i].sum()
-    size = np.sqrt(dot(inward, inward))
+    size = norm(inward)
     share = dot(inward, plane) / max(size * size, 1e-300)
     smooth = True
     for i in range(3):

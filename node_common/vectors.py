@@ -46,11 +46,10 @@ def differences(a, b):
 
 
 @inner
-def put(source, target):
+def assign_all(target, values):
     """Copy vectors, shape (n, 3), over others."""
-    for i in range(len(source)):
-        for c in range(3):
-            target[i, c] = source[i, c]
+    for i in range(len(values)):
+        assign(target[i], values[i])
 
 
 @inner

@@ -34,10 +34,9 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.session.scene_overrides import load_changed
-from cutting_trainer.tissue_sim.assembly import make_simulation
+from cutting_trainer.tissue_sim.assembly import load_kernels, make_simulation
 from cutting_trainer.tissue_sim.simulation.serialisation import StateError
 from cutting_trainer.tissue_sim.simulation.state import from_state, shape_of
-from cutting_trainer.tissue_sim.warm_up import warm_up_method
 
 _OF_THE_BEGINNING = ('tissue.mesh', 'tissue.unit', 'tissue.fixed', 'tissue.stretch')
 """Keys that make the shape of a tissue as a session begins."""
@@ -109,7 +108,7 @@ def recomputation(
     method = make_method(scene.cutting)
     if beginning is None or beginning.tissue is None:
         return Resimulation(make_simulation(scene.tissue, tools=len(scene.tools))[0], method)
-    warm_up_method(scene.tissue.integrator)
+    load_kernels(scene.tissue)
     try:
         simulation = from_state(beginning.tissue)
         if changed:

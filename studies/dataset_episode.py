@@ -125,7 +125,8 @@ def read_episode(bag: StudyBag, metadata: SessionMetadata) -> Episode:
         for feature, (of, data, _) in streams.items()
     }
     # The action is where the hand goes next.
-    values[ACTION] = np.vstack([values[STATE][1:], poses[-1:]])
+    following = np.searchsorted(streams[STATE][0], ticks, side='right')
+    values[ACTION] = poses[np.minimum(following, len(poses) - 1)]
     times = np.array((ticks + delay - first_time(opened)) * 1e-9, np.float64)
     return Episode(bag.name, values, times, rate, metadata.of(bag, opened))
 

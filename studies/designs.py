@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -36,26 +36,28 @@ class Setting:
 
     @cached_property
     def identity(self) -> str:
-        """Hash of the changes, whatever their order, and of a mesh that they name."""
+        """Hash of the changes, whatever their order; a mesh counts by its content."""
         if not self.number:
             return ''
-        text = json.dumps(_plain(self.changes), sort_keys=True).encode()
-        mesh = self.changes.get(MESH_KEY)
-        if isinstance(mesh, str) and Path(mesh).is_file():
-            text += hashlib.sha256(Path(mesh).read_bytes()).digest()
+        changes = dict(self.changes)
+        if self.mesh is not None and self.mesh.is_file():
+            changes[MESH_KEY] = hashlib.sha256(self.mesh.read_bytes()).hexdigest()
+        text = json.dumps(_plain(changes), sort_keys=True).encode()
         return hashlib.sha256(text).hexdigest()[:_HASH_DIGITS]
+
+    @property
+    def mesh(self) -> Path | None:
+        """File of another mesh."""
+        mesh = self.changes.get(MESH_KEY)
+        return Path(mesh) if isinstance(mesh, str) else None
 
     @property
     def in_yaml(self) -> dict[str, str]:
         """Values in YAML, as `restore_scene` takes them."""
         return {key: json.dumps(value) for key, value in self.changes.items()}
 
-    @property
-    def label(self) -> str:
-        """The changes in a few words."""
-        if not self.number:
-            return 'as recorded'
-        names = short_names(self.changes)
+    def label(self, names: Mapping[str, str]) -> str:
+        """Return the changes in a few words, with names of the keys as from `short_names`."""
         words = (f'{names[key]}={_short(value)}' for key, value in self.changes.items())
         return ', '.join(words) or 'unchanged'
 

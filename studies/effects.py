@@ -68,14 +68,18 @@ def effects_of_settings(
     values = _by_setting(rows)
     recorded = values.get(RECORDED.identity, {})
     found = []
-    for setting in _settings(rows):
+    settings = _settings(rows)
+    names = short_names(_keys(settings))
+    for setting in settings:
         bags = [bag for bag in values[setting.identity] if bag in recorded]
         for output in outputs if bags else ():
             now = np.array([values[setting.identity][bag][output] for bag in bags])
             then = np.array([recorded[bag][output] for bag in bags])
             mean, low, high = interval(now - then, confidence)
             reference = float(then.mean())
-            found.append(Effect(output, setting.label, mean, low, high, len(bags), reference))
+            found.append(
+                Effect(output, setting.label(names), mean, low, high, len(bags), reference)
+            )
     return found
 
 
@@ -90,14 +94,14 @@ def effects_of_keys(
         The effects, and the reason why there are none; ''.
     """
     settings = _settings(rows)
-    keys = list(dict.fromkeys(key for setting in settings for key in setting.changes))
-    if not keys:
-        return [], ''
+    keys = _keys(settings)
     if any(len(setting.changes) < len(keys) for setting in settings):
         return [], 'settings change different keys, so the keys have no effects of their own'
     columns = dict[str, Floats]()
     for key, name in short_names(keys).items():
         columns |= _columns(name, [setting.changes[key] for setting in settings])
+    if not columns:
+        return [], ''
     design = np.column_stack([np.ones(len(settings)), *columns.values()])
     values = _by_setting(rows)
     found = dict[str, list[Floats]]()
@@ -147,6 +151,10 @@ def interval(differences: Floats, confidence: float) -> tuple[float, float, floa
 def _settings(rows: Sequence[Row]) -> list[Setting]:
     found = {row.setting.number: row.setting for row in rows if row.setting.number}
     return [found[number] for number in sorted(found)]
+
+
+def _keys(settings: Sequence[Setting]) -> list[str]:
+    return list(dict.fromkeys(key for setting in settings for key in setting.changes))
 
 
 def _by_setting(rows: Sequence[Row]) -> dict[str, dict[str, Mapping[str, float]]]:

@@ -192,6 +192,9 @@ def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int, Run]:
     """Return the outputs of a row, the first frame that differs from the recording, and the run."""
     recording = read_recording(job.bag, job.bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
+    mesh = job.setting.mesh
+    if mesh is not None and not mesh.is_file():
+        raise UnavailableError(f'{mesh} is not there on this worker: give all the same folders')
     scene = load_scene(str(restore_scene(bag, folder, job.setting.in_yaml)))
     changed, differs = job.setting.number > 0, None
     refuse_lost_changes(beginning, job.setting.changes)

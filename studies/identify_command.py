@@ -159,9 +159,8 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         options: of the command.
         client: of the workers.
     """
-    keys = [*options.changes, *([MESH_KEY] if options.refine else [])]
-    observations = [_observe(bag, keys) for bag in bags]
-    tissues = [_tissue(bag, options.changes) for bag in bags]
+    read = [_observe(bag, options) for bag in bags]
+    observations, tissues = [one for one, _ in read], [tissue for _, tissue in read]
     tissue, material = tissues[0], tissues[0].material
     changes = {key: value_of(key, text) for key, text in options.changes.items()}
     names = tuple(dict.fromkeys(options.parameters)) or tuple(
@@ -172,12 +171,14 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         recorded = np.log([getattr(material, name) for name in names])
     running = _Running(bags, observations, names, changes, client)
     fit = Fit(observations, priors, options.noise, running.compute)
-    problem = fit.solve(fit.start(recorded), CONFIDENCE)
+    begin = fit.start(recorded)
+    running.check(fit.forces(begin))
+    problem = fit.solve(begin, CONFIDENCE)
     notes = [] if options.refine else [ON_RECORDED_MESH]
     notes += [
-        f'{bag.name} has another tissue than {bags[0].name}: all get the constants of one'
+        f'{bag.name} has another tissue than {bags[0].name}: only {", ".join(names)} are common'
         for bag, other in zip(bags, tissues, strict=True)
-        if (other.model, other.material) != (tissue.model, material)
+        if (other.model, other.material, other.regions) != (tissue.model, material, tissue.regions)
     ]
     if tissue.model in LOCKING:
         notes.append(
@@ -196,12 +197,7 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         problem = fit.solve(coarse, CONFIDENCE)
         problem = replace(problem, mesh_change=problem.estimates - coarse)
     forces = fit.forces(problem.at)
-    for bag, computed in zip(bags, forces, strict=True):
-        if np.isnan(computed).any():
-            raise SessionError(
-                f'{bag.name} cannot be computed with the constants that were found: '
-                f'{"; ".join(running.failures())}'
-            )
+    running.check(forces)
     return Identification(
         estimates=estimates_of(problem, priors),
         sentences=[*identifiability(problem), *notes, *running.failures()],
@@ -236,14 +232,33 @@ class _Running:
             for reason, count in self._reasons.items()
         ]
 
+    def check(self, forces: Sequence[Floats]) -> None:
+        """Refuse forces of the bags of which one could not be computed.
+
+        Raises:
+            SessionError: with the reasons.
+        """
+        for bag, computed in zip(self._bags, forces, strict=True):
+            if np.isnan(computed).any():
+                reasons = '; '.join(self.failures())
+                raise SessionError(f'{bag.name} cannot be computed: {reasons}')
+
     def compute(
-        self, wanted: Iterable[tuple[int, Point]], meshes: Sequence[str] = ()
+        self,
+        wanted: Iterable[tuple[int, Point]],
+        meshes: Sequence[str] = (),
+        *,
+        last: bool = False,
     ) -> dict[tuple[int, Point], Floats]:
         """Return computed forces by bag and point, NaN where they cannot be computed.
 
         Args:
             wanted: bags and points.
             meshes: file of each bag; (): those of the scenes.
+            last: those that no worker could compute are not tried again.
+
+        Raises:
+            SessionError: there is one.
         """
         from cutting_trainer.studies.cluster import compute
 
@@ -255,37 +270,43 @@ class _Running:
             setting = Setting(number, {**self._changes, **material, **mesh})
             keys[bag.hash, setting.identity] = key
             jobs.append(Job(str(bag.path), bag.hash, setting, here, series=True))
-        found = {}
+        found, lost = dict[tuple[int, Point], Floats](), dict[tuple[int, Point], str]()
         for job, result in compute(self._client, jobs):
             key = keys[job.bag_hash, job.setting.identity]
             self.computed += 1
             self.cpu += result.cpu
             if result.lost:
-                raise SessionError(f'{self._bags[key[0]].name}: {result.failure}')
-            if result.series is not None:
+                lost[key] = result.failure
+            elif result.series is not None:
                 found[key] = result.series
             else:
                 self._reasons[result.failure] = self._reasons.get(result.failure, 0) + 1
                 found[key] = np.full_like(self._observations[key[0]].felt, np.nan)
-        return found
+        if lost and last:
+            (bag_number, _), reason = next(iter(lost.items()))
+            raise SessionError(
+                f'{self._bags[bag_number].name} cannot be computed now: {reason}: mend that, and '
+                'start again'
+            )
+        return found | self.compute(lost, meshes, last=True) if lost else found
 
 
-def _observe(bag: StudyBag, keys: Sequence[str]) -> Observation:
-    """Return the recorded force of a bag, in which dotted keys of the scene can be changed."""
+def _observe(bag: StudyBag, options: IdentifyOptions) -> tuple[Observation, TissueSettings]:
+    """Return the recorded force of a bag, and the tissue of its scene with the changes."""
     try:
         recording = read_recording(str(bag.path), bag.hash)
-        refuse_lost_changes(recording.beginning, keys)
+        refuse_lost_changes(recording.beginning, options.changes)
+        if options.refine and recording.beginning.tissue is not None:
+            raise SessionError(
+                '--refine needs the beginning of the session, where its mesh is whole'
+            )
     except (BagError, SessionError) as error:
         raise BagError(f'{bag.name}: {error}') from None
-    felt = recording.felt
-    return Observation((felt.times - felt.times[0]) * 1e-9, felt.vectors)
-
-
-def _tissue(bag: StudyBag, changes: Mapping[str, str]) -> TissueSettings:
-    recording = read_recording(str(bag.path), bag.hash)
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
-        file = restore_scene(recording.bag, Path(temporary), changes)
-        return load_changed(file, changes).tissue
+        file = restore_scene(recording.bag, Path(temporary), options.changes)
+        tissue = load_changed(file, options.changes).tissue
+    felt = recording.felt
+    return Observation((felt.times - felt.times[0]) * 1e-9, felt.vectors), tissue
 
 
 def _digits(value: float) -> float:

@@ -1,10 +1,11 @@
 """`trainer study`: recorded hands on many changed tissues, on all processors."""
 
+import contextlib
 import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
@@ -151,7 +152,8 @@ def run_study(options: StudyOptions) -> Status:
         _write_tables(options.folder, plan)
         rows = plan.rows()
         summary = summarise(rows, study, plan.size)
-        write_page(options.folder / PAGE_FILE, options.file.stem, summary)
+        with _writing(options.folder):
+            write_page(options.folder / PAGE_FILE, options.file.stem, summary)
     _tell(options, plan, rows, summary)
     if interrupted:
         notes.print('interrupted: the same command goes on with what is left', highlight=False)
@@ -257,12 +259,19 @@ def _saving(write: Callable[[], None]) -> Callable[[], None]:
 
 def _write_tables(folder: Path, plan: Plan) -> None:
     rows = plan.rows()
-    try:
+    with _writing(folder):
         write_table(folder / TABLE_FILE, rows, plan.study.outputs)
         write_costs(folder / COSTS_FILE, rows)
+
+
+@contextlib.contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Turn an error of the disk into a sentence; pyarrow's has no number."""
+    try:
+        yield
     except OSError as error:
         raise SessionError(
-            f'{folder} cannot take the tables ({error}): make room, and start the study again; it '
+            f'{folder} cannot take the results ({error}): mend that, and start the study again; it '
             'goes on with what is left'
         ) from None
 

@@ -72,6 +72,8 @@ def test_forces_keep_their_rate_where_poses_come_less_often(monkeypatch) -> None
     assert thin.rate == whole.rate and thin.length == whole.length
     assert np.array_equal(thin.values[FORCES], whole.values[FORCES])
     assert not np.array_equal(thin.values[STATE], whole.values[STATE])
+    goes = np.any(thin.values[ACTION] != thin.values[STATE], axis=1)
+    assert np.mean(goes) > 0.9  # the next pose, not the one of the next tick
 
 
 def test_a_video_with_other_pictures_than_were_drawn_is_refused(tmp_path: Path) -> None:

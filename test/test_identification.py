@@ -18,6 +18,7 @@ from cutting_trainer.recordings.resimulate_command import refuse_lost_changes
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies import cluster, fit, identification
 from cutting_trainer.studies.bag_collection import find_bags
+from cutting_trainer.studies.cluster import lost
 from cutting_trainer.studies.evaluation import Job, Result
 from cutting_trainer.studies.fit import Fit, Observation
 from cutting_trainer.studies.identification import (
@@ -30,6 +31,7 @@ from cutting_trainer.studies.identification import (
 )
 from cutting_trainer.studies.identify_command import (
     IdentifyOptions,
+    _Running,
     identify,
     run_identification,
 )
@@ -281,8 +283,32 @@ def test_a_material_of_which_nothing_can_be_computed_is_no_result(
     options = IdentifyOptions((str(SAMPLES / 'palpation'),), tmp_path, ('youngs_modulus',))
     bags = find_bags(options.bags, tmp_path)
     monkeypatch.setattr(cluster, 'compute', failed)
-    with pytest.raises(SessionError, match=r'cannot be computed with .* failed: the tissue has no'):
+    with pytest.raises(
+        SessionError, match=r'palpation cannot be computed: \d+ .*: the tissue has no'
+    ):
         identify(bags, options, None)
+
+
+def test_a_session_that_no_worker_could_compute_is_tried_once_more(monkeypatch) -> None:
+    options = IdentifyOptions((str(SAMPLES / 'palpation'),), Path(), ('youngs_modulus',))
+    bags, tries = find_bags(options.bags, Path()), list[float]()
+    felt = np.zeros((3, 3))
+
+    def once(client: object, jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
+        for job in jobs:
+            tries.append(job.setting.changes['tissue.material.youngs_modulus'])
+            first = tries.count(tries[-1]) == 1
+            found = Result({}, 'gone' if first else '', 0, job.identity, 0.0, 0.0, 0, lost=first)
+            yield job, replace(found, series=None if first else felt)
+
+    monkeypatch.setattr(cluster, 'compute', once)
+    running = _Running(bags, [Observation(TIMES, felt)], options.parameters, {}, None)
+    assert running.compute([(0, (5000.0,))])[0, (5000.0,)] is felt and tries == [5000.0, 5000.0]
+    monkeypatch.setattr(
+        cluster, 'compute', lambda client, jobs: [(j, lost(j, 'gone')) for j in jobs]
+    )
+    with pytest.raises(SessionError, match='palpation cannot be computed now: gone'):
+        running.compute([(0, (5000.0,))])
 
 
 def test_a_mesh_cannot_be_changed_where_a_bag_begins_with_one() -> None:

@@ -140,6 +140,10 @@ def test_settings_with_other_names_for_one_value_are_one_and_meshes_count_by_con
         before, after = after, setting.identity
     assert setting.changes['tissue.mesh'] == str(tmp_path / 'fine.vtk')
     assert before != after
+    (tmp_path / 'moved.vtk').write_text(text)
+    design['grid']['tissue.mesh'] = ['moved.vtk']
+    (setting,) = settings_of(Designs.model_validate(design), tmp_path)
+    assert setting.identity == after
 
 
 def test_keys_that_share_their_last_word_are_told_apart() -> None:
@@ -148,7 +152,13 @@ def test_keys_that_share_their_last_word_are_told_apart() -> None:
         for i, x in enumerate((1, 2))
         for k, y in enumerate((3, 5))
     ]
-    assert settings[0].label == 'haptics.rate=1, tissue.rate=3, b=3'
+    effects = effects_of_settings(
+        made_rows(2, settings[::3], np.zeros((2, 3))), ['largest_force'], 0.95
+    )
+    assert effects[0].cause == 'haptics.rate=1, tissue.rate=3, b=3'
+    alone = [Setting(1, {'haptics.rate': 60}), Setting(2, {'tissue.rate': 60})]
+    effects = effects_of_settings(made_rows(2, alone, np.zeros((2, 3))), ['largest_force'], 0.95)
+    assert [effect.cause for effect in effects] == ['haptics.rate=60', 'tissue.rate=60']
     rows = made_rows(3, settings, np.array([[0, 10, 12, 11, 13]] * 3))
     found, _ = effects_of_keys(rows, ['largest_force'], 0.95)
     assert {e.cause: e.mean for e in found if 'rate' in e.cause} == pytest.approx(
@@ -161,13 +171,24 @@ def test_one_key_has_an_effect_of_its_own() -> None:
     rows = made_rows(2, settings, np.array([[0, 5, 8]] * 2))
     found, _ = effects_of_keys(rows, ['largest_force'], 0.95)
     assert [(effect.cause, effect.mean) for effect in found] == [('b 1 -> 2', 3.0)]
+    rows = made_rows(2, settings[:1], np.array([[0, 5]] * 2))
+    assert effects_of_keys(rows, ['largest_force'], 0.95) == ([], '')
 
 
 def test_a_bag_out_of_reach_is_no_row(monkeypatch) -> None:
     monkeypatch.setattr(evaluation, 'warm_up', lambda: None)
     job = Job('/nowhere', '0', RECORDED, identity_of_worker())
+    (bag,) = find_bags(['palpation'], SAMPLES)
     gone = evaluation.evaluate(job)
     assert gone.lost and gone.failure.startswith('/nowhere is not there on this worker')
+    mesh = replace(
+        job,
+        setting=Setting(1, {'tissue.mesh': '/nowhere/fine.vtk'}),
+        bag=str(bag.path),
+        bag_hash=bag.hash,
+    )
+    gone = evaluation.evaluate(mesh)
+    assert gone.lost and gone.failure.startswith('/nowhere/fine.vtk is not there')
     monkeypatch.setattr(evaluation, 'read_recording', lambda *_: [][1])
     assert not evaluation.evaluate(job).lost
 

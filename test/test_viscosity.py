@@ -1,5 +1,7 @@
 """Viscosity against the exact answers of its Prony series, and what it must not do."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from meshes import irregular_box
@@ -14,6 +16,7 @@ from cutting_trainer.tissue_sim.contact.coupling import FREE, HOLD, Coupling
 from cutting_trainer.tissue_sim.elasticity.compliance import solve_static
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ModelName
+from cutting_trainer.tissue_sim.elasticity.rotation import LANES
 from cutting_trainer.tissue_sim.elasticity.viscosity import Viscosity
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
@@ -37,9 +40,10 @@ def block(
     active: ActiveSettings | None = None,
     density: float = DENSITY,
     stepping: TimeStepping | None = None,
+    cells: int = 3,
 ) -> Dynamics:
     """A cube held at its underside."""
-    nodes, tets = irregular_box((3, 3, 3), SIDE / 3, 2, 0.15)
+    nodes, tets = irregular_box((cells, cells, cells), SIDE / cells, 2, 0.15)
     mesh = TetMesh(nodes, tets, nodes[:, 2] < 1e-9)
     material = Material(E, NU, density, alpha, beta, 6.0, prony)
     stepping = stepping or TimeStepping(integrator, max_substeps=5000, min_substeps=8)
@@ -60,6 +64,26 @@ def waited(dynamics: Dynamics, seconds: float, steps: int) -> np.ndarray:
         assert dynamics.loads is not None
         dynamics.loads.advance(dynamics.displacement.ravel(), seconds / steps, spans)
     return dynamics.model.force(dynamics.displacement)
+
+
+@every_model
+def test_nodes_relax_alone_as_with_others(name: ModelName) -> None:
+    # Some fill chunks, and others a part of one.
+    together, alone = (block(name, TWO, cells=4) for _ in range(2))
+    n = together.mesh.node_count
+    assert n % LANES and n > LANES
+    moved = 1e-3 * np.random.default_rng(1).standard_normal((n, 3))
+    for dynamics, ends in ((together, [0, n]), (alone, range(n + 1))):
+        dynamics.displacement[:] = moved
+        for spans in pairwise(ends):
+            viscosity_of(dynamics).advance(
+                dynamics.displacement.ravel(), 0.1, np.array([spans]), dynamics.model.load
+            )
+            viscosity_of(dynamics)._time -= 0.1
+    load = together.model.load
+    assert np.abs(load).max() > 0
+    assert alone.model.load == pytest.approx(load, rel=1e-6, abs=1e-9 * np.abs(load).max())
+    assert viscosity_of(alone).energy == pytest.approx(viscosity_of(together).energy, rel=1e-6)
 
 
 @every_model

@@ -95,6 +95,27 @@ for model in MODELS:
 report(before)
 """
 
+SELDOM = """
+from pathlib import Path
+import numpy as np
+from cutting_trainer.session.scene_loader import load_scene
+from cutting_trainer.session.scene_overrides import write_changed
+from cutting_trainer.tissue_sim.assembly import make_simulation
+from cutting_trainer.tissue_sim.contact.tool import indenter_contact
+
+changes = {
+    'tissue.active_region': '{mode: budget, nodes: 20}',
+    'tissue.material.prony': '[[0.3, 0.1]]',
+}
+scene = load_scene(str(write_changed(load_scene('block'), Path(sys.argv[1]), changes)))
+simulation, _ = make_simulation(scene.tissue)
+before, mesh = loaded(), simulation.mesh
+for depth in (1e-3, 2e-3):
+    place = mesh.rest.max(axis=0) * [0.5, 0.5, 1.0]
+    simulation.frame(indenter_contact(mesh, place, np.array([0.0, 0.0, -1.0]), depth))
+report(before)
+"""
+
 SAVE = """
 import sys
 from numba.core.caching import IndexDataCacheFile
@@ -129,6 +150,11 @@ def test_setup_has_compiled_and_nodes_have_loaded_all_that_a_session_calls(scene
 
 def test_warm_up_leaves_no_kernel_to_be_compiled_in_a_session() -> None:
     (later,) = said(MUCH_CUT)
+    assert later.endswith(' loaded later: {}'), later
+
+
+def test_a_scene_with_far_field_and_viscosity_has_loaded_their_kernels(tmp_path: Path) -> None:
+    (later,) = said(SELDOM, str(tmp_path))
     assert later.endswith(' loaded later: {}'), later
 
 

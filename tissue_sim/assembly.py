@@ -20,13 +20,7 @@ from cutting_trainer.tissue_sim.planner.memory import recall, remember
 from cutting_trainer.tissue_sim.planner.plan import Plan, plan
 from cutting_trainer.tissue_sim.scene_schema import ActiveRegionSettings, TissueSettings
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
-from cutting_trainer.tissue_sim.warm_up import (
-    warm_up,
-    warm_up_far_field,
-    warm_up_method,
-    warm_up_models,
-    warm_up_viscosity,
-)
+from cutting_trainer.tissue_sim.warm_up import warm_up, warm_up_method, warm_up_models
 
 
 def load_tissue(
@@ -168,11 +162,7 @@ def make_simulation(
     task = make_task(settings, None if settings.method == 'auto' else mesh)
     found = make_plan(task, note, note) if settings.method == 'auto' else None
     taken = as_planned(settings, found)
-    warm_up_method(taken.integrator)
-    if taken.active_region.mode == 'budget':
-        warm_up_far_field()
-    if taken.material.prony:
-        warm_up_viscosity()
+    load_kernels(taken)
     simulation = TissueSimulation(
         mesh or task.mesh,
         task.material,
@@ -191,6 +181,17 @@ def make_simulation(
     else:
         simulation.resume(before.displacement, before.step)
     return simulation, found
+
+
+def load_kernels(settings: TissueSettings) -> None:
+    """Load all kernels that a scene needs, in the order that gives the same bits each time.
+
+    Args:
+        settings: its section `tissue`, with a known method.
+    """
+    far_field = settings.active_region.mode == 'budget'
+    viscous = bool(settings.material.prony)
+    warm_up_method(settings.integrator, far_field=far_field, viscous=viscous)
 
 
 def as_planned(settings: TissueSettings, found: Plan | None) -> TissueSettings:

@@ -41,19 +41,28 @@ def warm_up() -> None:
     """
     for integrator in INTEGRATORS:
         warm_up_method(integrator)
-    warm_up_far_field()
-    warm_up_viscosity()
+    warm_up_method(integrator, far_field=True, viscous=True)
 
 
-def warm_up_method(integrator: IntegratorName) -> None:
+def warm_up_method(
+    integrator: IntegratorName, *, far_field: bool = False, viscous: bool = False
+) -> None:
     """Run every model, and one integrator; move a tool through a cube, and remove an element.
 
     The kernels of all models come first, and in the same order for all integrators: of a kernel
     inlined in several others, a process runs the copy loaded first, and copies may differ in the
     last bit. A fixed order makes results reproducible. Those that few scenes need come last.
+
+    Args:
+        integrator: name.
+        far_field, viscous: whether a tissue has a far field or viscosity.
     """
     warm_up_models()
     warm_up_frames(integrator)
+    if far_field:
+        _warm_up_far_field()
+    if viscous:
+        _warm_up_viscosity()
 
 
 @cache
@@ -114,13 +123,13 @@ def warm_up_models() -> None:
 
 
 @cache
-def warm_up_far_field() -> None:
+def _warm_up_far_field() -> None:
     """Move a cube with a far field by every model. Only the first call does anything."""
     _move_every_model(ActiveSettings('budget', 6))
 
 
 @cache
-def warm_up_viscosity() -> None:
+def _warm_up_viscosity() -> None:
     """Move a viscous cube. Only the first call does anything."""
     viscous = replace(_MATERIAL, prony=((0.5, 1.0),))
     Dynamics(small_cube(), viscous, 'stiffening', _STEPPING).advance(Coupling())

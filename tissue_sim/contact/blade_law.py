@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.node_common.vectors import cross, differences, dot, sum_of
+from cutting_trainer.node_common.vectors import cross, differences, dot, norm, sum_of
 from cutting_trainer.tissue_sim.contact.crack import (
     borne_share,
     bound_run,
@@ -173,7 +173,7 @@ def follow_device(edge, strips, device, moved, tissue, law):
         for c in range(3):
             torque[c] += turn[c]
     line, mean = _line(edge.spans, ways)
-    lag = np.sqrt(dot(mean, mean))
+    lag = norm(mean)
     return Pull(
         force, torque, limit, torque_limit, line, lag, paid, rubbed, swept, held, forces, most
     )
@@ -298,7 +298,7 @@ def _direction(device):
     edge = np.empty(3)
     for c in range(3):
         edge[c] = device[POINTS - 1, c] - device[0, c]
-    length = np.sqrt(dot(edge, edge))
+    length = norm(edge)
     for c in range(3):
         edge[c] /= length
     return edge, length / (POINTS - 1)
@@ -354,7 +354,7 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits, costs):
     for i in range(POINTS):
         if edge.spans[i] == 0.0:
             continue
-        size = max(np.sqrt(dot(ways[i], ways[i])), TINY)
+        size = max(norm(ways[i]), TINY)
         borne = share * limits[i] if fresh[i] else limits[i]
         slid[i] = max(size - borne / (law.stiffness * edge.spans[i]), 0.0)
         if not fresh[i]:

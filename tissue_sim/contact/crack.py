@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
-from cutting_trainer.node_common.vectors import dot
+from cutting_trainer.node_common.vectors import dot, norm
 from cutting_trainer.tissue_sim.contact.immersion import SETTLED
 
 _STAYS = 1e9
@@ -58,7 +58,7 @@ def next_tooth(edge, ways, fresh, limits, piece, law):
         ahead += span
         steady += limits[i]
         friction += law.friction[edge.region[i]] * piece * span
-        pull += law.stiffness * span * np.sqrt(dot(ways[i], ways[i]))
+        pull += law.stiffness * span * norm(ways[i])
         for c in range(3):
             push[c] += span * ways[i, c]
     size, stiffness = dot(push, push), 0.0
@@ -141,7 +141,7 @@ def note_run(edge, points, places, tissue, fresh):
     for c in range(3):
         rest[c] = _mean(edge.spans, after[:, c] - places[:, c], fresh)
         now[c] = _mean(edge.spans, edge.points[:, c] - points[:, c], fresh)
-    run, slip = np.sqrt(dot(rest, rest)), np.sqrt(dot(now, now))
+    run, slip = norm(rest), norm(now)
     left = edge.running[0] - run
     edge.running[0] = left if left > SETTLED else 0.0
     if run < SETTLED or slip < SETTLED:

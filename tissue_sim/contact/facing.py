@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
-from cutting_trainer.node_common.vectors import dot
+from cutting_trainer.node_common.vectors import dot, norm
 
 TINY = 1e-300
 """Divisor that is no length, where these are 0."""
@@ -66,7 +66,7 @@ def across(facing, direction):
     part, along = np.empty(3), dot(facing, direction)
     for c in range(3):
         part[c] = facing[c] - along * direction[c]
-    size = np.sqrt(dot(part, part))
+    size = norm(part)
     for c in range(3):
         part[c] = part[c] / size if size >= _MIN_ACROSS else 0.0
     return part
@@ -89,7 +89,7 @@ def hold(edge, ways, blade, law, limits):
     held = False
     for i in range(len(limits)):
         if blade.shares[i] > 0.0:
-            stretch = np.sqrt(dot(ways[i], ways[i])) + _HELD_REACH
+            stretch = norm(ways[i]) + _HELD_REACH
             limits[i] += law.stiffness * edge.spans[i] * blade.shares[i] * stretch
             held = held or blade.shares[i] > _HELD_SHARE
     return held

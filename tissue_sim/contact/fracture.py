@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
-from cutting_trainer.node_common.vectors import put
+from cutting_trainer.node_common.vectors import assign_all
 
 BLADE_THICKNESS = 4e-4
 """Of a scalpel's blade [m]. Up to half of it away from a cut, the blade is still in that cut."""
@@ -93,15 +93,15 @@ def add_strip(strips, before, after):
     knots, counts = strips
     count = counts[0]
     if counts[1] and _path_length(knots[count - 1, 0], after) < _MAX_STRIP:
-        put(after, knots[count - 1, 1])
+        assign_all(knots[count - 1, 1], after)
         return
     if count == MAX_STRIPS:
         for k in range(count - 1):
             for side in range(2):
-                put(knots[k + 1, side], knots[k, side])
+                assign_all(knots[k, side], knots[k + 1, side])
         count -= 1
-    put(before, knots[count, 0])
-    put(after, knots[count, 1])
+    assign_all(knots[count, 0], before)
+    assign_all(knots[count, 1], after)
     counts[0], counts[1] = count + 1, 1
 
 

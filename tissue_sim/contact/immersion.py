@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner
-from cutting_trainer.node_common.vectors import differences, dot, put, sum_of
+from cutting_trainer.node_common.vectors import assign_all, differences, dot, sum_of
 from cutting_trainer.tissue_sim.contact.fracture import BLADE_THICKNESS
 from cutting_trainer.tissue_sim.mesh.locate import locate_points
 
@@ -174,7 +174,7 @@ def lag_behind(edge, device):
         while ahead < POINTS and edge.spans[ahead] == 0.0:
             ahead += 1
         if last < 0 and ahead == POINTS:
-            put(device, points)
+            assign_all(points, device)
             return
         first, second = last if last >= 0 else ahead, ahead if ahead < POINTS else last
         part = 0.0
@@ -223,7 +223,7 @@ def _go_to_tissue(edge, device, tissue, found):
             if found[i] >= 0:
                 return
     if steps == 0:
-        put(device, edge.points)
+        assign_all(edge.points, device)
         _locate(tissue, edge.points, edge.hint[0], found, edge.weights)
 
 

@@ -32,8 +32,9 @@ KEPT = 7
 LINEAR, TURNING, LAW = 0, 1, 2
 _ROTATION_TOLERANCE = 1e-9
 """[rad]; its square is the error of a stress."""
-_TURN = SLOTS
-"""First slot of R by rows, after the slots of `rotation`."""
+_MATRIX = SLOTS
+"""First slot of R by rows. A chunk has the slots of `rotation` first, with F and the quaternion of
+R, then these, each of LANES numbers."""
 _RESULT, _STRAIN, _TERM, _TOTAL = SLOTS + 9, SLOTS + 15, SLOTS + 21, SLOTS + 27
 """First slots of symmetric tensors by xx, yy, zz, xy, xz, yz."""
 _RATE, _AWAY, _SQUARE, _GAINED, _BEFORE, _STORED, _LOST, _SLOTS = range(SLOTS + 33, SLOTS + 41)
@@ -53,6 +54,15 @@ def _put(x, y, z, rotation, i, at, chunk):
         chunk[at + (ROTATION + k) * L] = rotation[i, k]
 
 
+@inner
+def _put_rest(chunk, at):
+    """Write F and R of a node at rest to a lane: no other waits for it to settle."""
+    for k in range(ROTATION + 4):
+        chunk[at + k * LANES] = 0.0
+    for k in (0, 4, 8, ROTATION):
+        chunk[at + k * LANES] = 1.0
+
+
 @inner(error_model='numpy', fastmath=SAFE_MATH)
 def _put_matrix(chunk):
     """Compute R from the quaternions of all lanes."""
@@ -60,20 +70,20 @@ def _put_matrix(chunk):
     E = chunk[0 : _SLOTS * L]
     for b in range(L):
         w, x, y, z = E[b + 9 * L], E[b + 10 * L], E[b + 11 * L], E[b + 12 * L]
-        E[b + _TURN * L] = 1 - 2 * (y * y + z * z)
-        E[b + (_TURN + 1) * L] = 2 * (x * y - w * z)
-        E[b + (_TURN + 2) * L] = 2 * (x * z + w * y)
-        E[b + (_TURN + 3) * L] = 2 * (x * y + w * z)
-        E[b + (_TURN + 4) * L] = 1 - 2 * (x * x + z * z)
-        E[b + (_TURN + 5) * L] = 2 * (y * z - w * x)
-        E[b + (_TURN + 6) * L] = 2 * (x * z - w * y)
-        E[b + (_TURN + 7) * L] = 2 * (y * z + w * x)
-        E[b + (_TURN + 8) * L] = 1 - 2 * (x * x + y * y)
+        E[b + _MATRIX * L] = 1 - 2 * (y * y + z * z)
+        E[b + (_MATRIX + 1) * L] = 2 * (x * y - w * z)
+        E[b + (_MATRIX + 2) * L] = 2 * (x * z + w * y)
+        E[b + (_MATRIX + 3) * L] = 2 * (x * y + w * z)
+        E[b + (_MATRIX + 4) * L] = 1 - 2 * (x * x + z * z)
+        E[b + (_MATRIX + 5) * L] = 2 * (y * z - w * x)
+        E[b + (_MATRIX + 6) * L] = 2 * (x * z - w * y)
+        E[b + (_MATRIX + 7) * L] = 2 * (y * z + w * x)
+        E[b + (_MATRIX + 8) * L] = 1 - 2 * (x * x + y * y)
 
 
 @inner(error_model='numpy', fastmath=SAFE_MATH)
 def _turn_back(chunk):
-    """Compute sym(R^T F) of all lanes."""
+    """Compute sym(R^T F) of all lanes, into the slots `_RESULT`."""
     L = LANES
     E = chunk[0 : _SLOTS * L]
     for b in range(L):
@@ -81,8 +91,8 @@ def _turn_back(chunk):
             for j in range(i, 3):
                 both = 0.0
                 for k in range(3):
-                    both += E[b + (_TURN + 3 * k + i) * L] * E[b + (3 * k + j) * L]
-                    both += E[b + (_TURN + 3 * k + j) * L] * E[b + (3 * k + i) * L]
+                    both += E[b + (_MATRIX + 3 * k + i) * L] * E[b + (3 * k + j) * L]
+                    both += E[b + (_MATRIX + 3 * k + j) * L] * E[b + (3 * k + i) * L]
                 at = i if i == j else 2 + i + j
                 E[b + (_RESULT + at) * L] = 0.5 * both
 
@@ -108,7 +118,7 @@ def _put_law_stress(chunk, at, law, f, p):
     """Replace F of a lane by its stress without the part along the change of volume [Pa].
 
     Args:
-        chunk: see `_turn_back`.
+        chunk: see `_MATRIX`.
         at: lane.
         law: mu, 0, lambda and b, see `stiffening_stress`.
         f, p: scratch, shape (9,).
@@ -197,7 +207,7 @@ def _turn_total(chunk):
                 turned = 0.0
                 for k in range(3):
                     at = k if k == j else 2 + k + j
-                    turned += E[b + (_TURN + 3 * i + k) * L] * E[b + (_TOTAL + at) * L]
+                    turned += E[b + (_MATRIX + 3 * i + k) * L] * E[b + (_TOTAL + at) * L]
                 E[b + (3 * i + j) * L] = turned
 
 
@@ -206,8 +216,9 @@ def _follow_series(chunk, nodes, low, high, now, series, law, kind):
     """Let all terms of a chunk's nodes follow their stress.
 
     Args:
-        chunk: see `_turn_back`; its total, energy and loss are written.
-        nodes, now, series, law, kind: see `relieve`.
+        chunk: see `_MATRIX`; its total, energy and loss are written.
+        nodes: of which the terms change; and
+        now, series, law, kind: see `relieve`.
         low, high: the nodes.
     """
     L = LANES
@@ -259,7 +270,6 @@ def relieve(domains, nodes, spans, u, now, series, law, kind, load):
     """
     L = LANES
     chunk, f, p = np.zeros(_SLOTS * L), np.empty(9), np.empty(9)
-    chunk[ROTATION * L : (ROTATION + 1) * L] = 1.0
     lost = away = 0.0
     for s in range(spans.shape[0]):
         for low in range(spans[s, 0], spans[s, 1], L):
@@ -267,6 +277,8 @@ def relieve(domains, nodes, spans, u, now, series, law, kind, load):
             for i in range(low, high):
                 rows = smoothed_gradient(domains, u, i)
                 _put(rows[0], rows[1], rows[2], nodes.rotation, i, i - low, chunk)
+            for b in range(high - low, L):
+                _put_rest(chunk, b)
             if kind != LINEAR:
                 settle(chunk, _ROTATION_TOLERANCE, 100)
                 for i in range(low, high):
