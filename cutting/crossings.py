@@ -7,7 +7,7 @@ import numpy as np
 from cutting_trainer.cutting.geometry import EDGE_NODES, height, orientation
 from cutting_trainer.cutting.lookup import base_of, edge_key, edge_slot, is_on_cut
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.node_common.vectors import cross, norm
+from cutting_trainer.node_common.vectors import area_vector, norm
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 _EXACT = 1e-6
@@ -56,12 +56,9 @@ def surfaces(corners: np.ndarray) -> np.ndarray:
 def _normals(triangles):
     """Return unit normals of triangles (k, 3, 3), and twice their areas [m^2]."""
     normals = np.empty((len(triangles), 3))
-    sizes, one, other = np.empty(len(triangles)), np.empty(3), np.empty(3)
+    sizes = np.empty(len(triangles))
     for k in range(len(triangles)):
-        for c in range(3):
-            one[c] = triangles[k, 1, c] - triangles[k, 0, c]
-            other[c] = triangles[k, 2, c] - triangles[k, 0, c]
-        cross(one, other, normals[k])
+        area_vector(triangles[k, 0], triangles[k, 1], triangles[k, 2], normals[k])
         sizes[k] = norm(normals[k])
         for c in range(3):
             normals[k, c] /= max(sizes[k], _MIN_NORMAL)

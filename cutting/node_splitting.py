@@ -8,7 +8,7 @@ from cutting_trainer.cutting.geometry import orientation
 from cutting_trainer.cutting.lookup import SNAPPED, is_on_cut, on_cut_bits, origin_of
 from cutting_trainer.cutting.subdivision_cases import FRONT, LABEL_FACES
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.node_common.vectors import cross, norm
+from cutting_trainer.node_common.vectors import area_vector, norm
 from cutting_trainer.tissue_sim.mesh.topology import FACE_NODES
 
 
@@ -272,10 +272,8 @@ def split_nodes(patch, concerned, rest, new_rest):
 @inner
 def _face_area(x, face):
     a, b, c = x[FACE_NODES[face, 0]], x[FACE_NODES[face, 1]], x[FACE_NODES[face, 2]]
-    one, other, normal = np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        one[i], other[i] = b[i] - a[i], c[i] - a[i]
-    cross(one, other, normal)
+    normal = np.empty(3)
+    area_vector(a, b, c, normal)
     return 0.5 * norm(normal)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from cutting_trainer.cutting.geometry import altitude, height
 from cutting_trainer.cutting.lookup import SNAPPED, base_of
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.node_common.vectors import cross, dot, norm
+from cutting_trainer.node_common.vectors import assign, cross, dot, norm
 from cutting_trainer.tissue_sim.mesh.topology import CUT, FACE_NODES
 
 _MIN_ALTITUDE_LEFT = 0.4
@@ -259,7 +259,7 @@ def find_slide(star, plane, links, rest, fixed, shape, at, where, outline, way):
         cross(a, b, turn)
         if dot(turn, turn) > sharpest:
             sharpest = dot(turn, turn)
-            across[0], across[1], across[2] = turn[0], turn[1], turn[2]
+            assign(across, turn)
     inward, tangent = np.empty(3), np.empty(3)
     _volume_gradient(star, rest, at, where, inward)
     if normals[:, 3].min() == 2.0:  # within the tissue, where volume does not change

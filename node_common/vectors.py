@@ -36,6 +36,14 @@ def cross(a, b, out):
 
 
 @inner
+def area_vector(a, b, c, out):
+    """Write the vector square to a triangle whose length is twice its area."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] = (b[j] - a[j]) * (c[k] - a[k]) - (b[k] - a[k]) * (c[j] - a[j])
+
+
+@inner
 def differences(a, b):
     """Return the vectors of a less those of b, each shape (n, 3)."""
     found = np.empty((len(a), 3))
@@ -58,4 +66,13 @@ def sum_of(values):
     total = 0.0
     for i in range(len(values)):
         total += values[i]
+    return total
+
+
+@inner
+def weighted_sum(weights, values):
+    """Return the sum of numbers, each times its weight."""
+    total = 0.0
+    for i in range(len(weights)):
+        total += weights[i] * values[i]
     return total

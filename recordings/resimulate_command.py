@@ -62,23 +62,23 @@ def resimulate(folder: Path, changes: Mapping[str, str], *, as_json: bool = Fals
         if changes:
             changed = load_changed(restore_scene(bag, Path(temporary), changes), changes)
             warm_up_cutting(changed.cutting)
-            refuse_lost_changes(find_beginning(bag), changes)
+            refuse_lost_changes(bag, changes)
             return _experiment(bag, scene, changed, changes, as_json=as_json)
         return _verify(bag, scene, as_json=as_json)
 
 
-def refuse_lost_changes(beginning: ComputationStart, keys: Collection[str]) -> None:
+def refuse_lost_changes(bag: Bag, keys: Collection[str]) -> None:
     """Refuse changes without effect on a bag that begins with the shape of a tissue.
 
     Args:
-        beginning: of the bag.
+        bag: bag of the session.
         keys: dotted, of the changed values.
 
     Raises:
         SessionError: there is one.
     """
     lost = [key for key in keys if key in _OF_THE_BEGINNING]
-    if lost and beginning.tissue is not None:
+    if lost and find_beginning(bag).tissue is not None:
         raise SessionError(
             f'{lost[0]} cannot be changed: the bag begins in mid-session, with its own mesh. '
             'Take a bag with the beginning of its session'

@@ -15,7 +15,7 @@ from rich.progress import Progress
 from cutting_trainer.bags.playback_messages import first_time
 from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.resimulation import answer_frames, as_recorded
-from cutting_trainer.bags.resimulation_start import computable_frames, find_beginning
+from cutting_trainer.bags.resimulation_start import computable_frames
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation, refuse_lost_changes
@@ -72,7 +72,7 @@ def view_bag(options: ReplayOptions) -> Status:
         recording, scene = _recording(bag, Path(temporary), options.changes)
         if options.resimulate or options.changes:
             name = ', '.join(f'{k}={v}' for k, v in options.changes.items()) or 'computed again'
-            refuse_lost_changes(find_beginning(bag), options.changes)
+            refuse_lost_changes(bag, options.changes)
             computed = resimulated(bag, scene, notes, changed=bool(options.changes))
             beside = computed_beside(name, computed)
         elif options.beside is not None:

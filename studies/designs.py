@@ -73,11 +73,11 @@ def settings_of(designs: Designs, folder: Path = Path()) -> list[Setting]:
         designs: of the study.
         folder: of the study file, to which a mesh is relative.
     """
-    found: dict[str, Setting] = {}
+    found, folder = dict[str, Setting](), folder.resolve()
     for changes in _all_changes(designs):
         mesh = changes.get(MESH_KEY)
         if isinstance(mesh, str):
-            changes = {**changes, MESH_KEY: str(folder.resolve() / mesh)}
+            changes = {**changes, MESH_KEY: str(folder / mesh)}
         setting = Setting(len(found) + 1, changes)
         found.setdefault(setting.identity, setting)
     return list(found.values())

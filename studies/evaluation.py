@@ -49,7 +49,7 @@ from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
 
 
 class UnavailableError(RuntimeError):
-    """A worker cannot reach a bag."""
+    """A worker cannot reach a bag or a mesh."""
 
 
 _SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError, UnavailableError)
@@ -192,12 +192,11 @@ def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int, Run]:
     """Return the outputs of a row, the first frame that differs from the recording, and the run."""
     recording = read_recording(job.bag, job.bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
-    mesh = job.setting.mesh
-    if mesh is not None and not mesh.is_file():
-        raise UnavailableError(f'{mesh} is not there on this worker: give all the same folders')
+    if (mesh := job.setting.mesh) is not None:
+        _require(mesh)
     scene = load_scene(str(restore_scene(bag, folder, job.setting.in_yaml)))
     changed, differs = job.setting.number > 0, None
-    refuse_lost_changes(beginning, job.setting.changes)
+    refuse_lost_changes(bag, job.setting.changes)
     computed = recomputation(scene, beginning, changed=changed)
     if changed:
         run = move_hand(recording.records, recording.poses, recording.indexings, scene, computed)
@@ -216,14 +215,18 @@ def read_recording(folder: str, expected_hash: str) -> Recording:
         BagError: it is unreadable, or another one than that of the study.
         SessionError: the bag has no poses, or no forces of the hand.
     """
-    if not Path(folder).is_dir():
-        raise UnavailableError(f'{folder} is not there on this worker: give all the same folders')
+    _require(Path(folder))
     if hash_of_bag(Path(folder)) != expected_hash:
         raise BagError(f'{folder} is not the bag that the study was started with: it has changed')
     bag = open_bag(folder)
     records, poses = computable_poses(bag)
     felt = recorded_force(bag, poses)
     return Recording(bag, find_beginning(bag), records, poses, recorded_indexings(bag), felt)
+
+
+def _require(path: Path) -> None:
+    if not path.exists():
+        raise UnavailableError(f'{path} is not there on this worker: give all the same folders')
 
 
 def _reason(error: Exception) -> str:

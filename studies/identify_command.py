@@ -295,7 +295,7 @@ def _observe(bag: StudyBag, options: IdentifyOptions) -> tuple[Observation, Tiss
     """Return the recorded force of a bag, and the tissue of its scene with the changes."""
     try:
         recording = read_recording(str(bag.path), bag.hash)
-        refuse_lost_changes(recording.beginning, options.changes)
+        refuse_lost_changes(recording.bag, options.changes)
         if options.refine and recording.beginning.tissue is not None:
             raise SessionError(
                 '--refine needs the beginning of the session, where its mesh is whole'

@@ -139,8 +139,9 @@ def run_study(options: StudyOptions) -> Status:
         raise SessionError(NO_DASK)
     study = read_study(options.file)
     notes = Console(stderr=True, soft_wrap=True)
-    bags = bags_of(study, options.file.resolve().parent, notes)
-    settings = [RECORDED, *settings_of(study.settings, options.file.resolve().parent)]
+    beside = options.file.resolve().parent
+    bags = bags_of(study, beside, notes)
+    settings = [RECORDED, *settings_of(study.settings, beside)]
     if not options.folder.parent.is_dir() or options.folder.is_file():
         raise SessionError(
             f'{options.folder} cannot be made: name a folder with --output in one that exists'
@@ -213,7 +214,7 @@ def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
     return True
 
 
-def workers_of(options: WorkerOptions, most: int = 1024) -> AbstractContextManager[Any]:
+def workers_of(options: WorkerOptions, most: int | None = None) -> AbstractContextManager[Any]:
     """Return a client of the workers that options ask for, no more own ones than `most`.
 
     Raises:
@@ -227,7 +228,8 @@ def workers_of(options: WorkerOptions, most: int = 1024) -> AbstractContextManag
         )
     if options.scheduler:
         return others_cluster(options.scheduler)
-    return own_cluster(min(options.workers or len(os.sched_getaffinity(0)), most))
+    own = options.workers or len(os.sched_getaffinity(0))
+    return own_cluster(own if most is None else min(own, most))
 
 
 def _progress(notes: Console) -> Progress:

@@ -14,6 +14,7 @@ import pytest
 
 from cutting_trainer.bags.reader import open_bag
 from cutting_trainer.bags.resimulation_start import find_beginning
+from cutting_trainer.recordings import resimulate_command
 from cutting_trainer.recordings.resimulate_command import refuse_lost_changes
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies import cluster, fit, identification
@@ -311,13 +312,15 @@ def test_a_session_that_no_worker_could_compute_is_tried_once_more(monkeypatch) 
         running.compute([(0, (5000.0,))])
 
 
-def test_a_mesh_cannot_be_changed_where_a_bag_begins_with_one() -> None:
-    beginning = find_beginning(open_bag(SAMPLES / 'palpation'))
-    refuse_lost_changes(beginning, ['tissue.mesh'])
+def test_a_mesh_cannot_be_changed_where_a_bag_begins_with_one(monkeypatch) -> None:
+    bag = open_bag(SAMPLES / 'palpation')
+    beginning = find_beginning(bag)
+    refuse_lost_changes(bag, ['tissue.mesh'])
     later = replace(beginning, tissue=ObjectState('', b''))
-    refuse_lost_changes(later, ['tissue.model'])
+    monkeypatch.setattr(resimulate_command, 'find_beginning', lambda _: later)
+    refuse_lost_changes(bag, ['tissue.model'])
     with pytest.raises(SessionError, match=r'tissue\.mesh cannot be changed: the bag begins'):
-        refuse_lost_changes(later, ['tissue.model', 'tissue.mesh'])
+        refuse_lost_changes(bag, ['tissue.model', 'tissue.mesh'])
 
 
 def test_a_constant_that_there_is_not_is_refused_before_anything_is_computed(

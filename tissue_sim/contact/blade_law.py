@@ -7,7 +7,15 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
-from cutting_trainer.node_common.vectors import cross, differences, dot, norm, sum_of
+from cutting_trainer.node_common.vectors import cross, differences, dot, norm, sum_of, weighted_sum
+from cutting_trainer.tissue_sim.contact.blade_edge import (
+    KNOT_POINTS,
+    edge_box,
+    edge_direction,
+    edge_knots,
+    edge_line,
+    split_way,
+)
 from cutting_trainer.tissue_sim.contact.crack import (
     borne_share,
     bound_run,
@@ -45,14 +53,11 @@ WHOLE = POINTS / 2
 """Points in the tissue at which their springs are as stiff as the coupling: half of the edge. Each
 has the same stiffness however many there are, else a spring that goes in or out would take energy
 from the others or give it to them."""
-_KNOTS = np.rint(np.linspace(0, POINTS - 1, KNOTS)).astype(np.int64)
 _MAX_SLIPS = 12
 _MAX_FREE_SLIP = BLADE_THICKNESS / 2
 """[m] by which the edge slips along a cut before what is ahead of it is looked up again."""
 _BEYOND = 1e-5
 """[m] beyond the end of the edge, where the tip looks for uncut tissue."""
-_MIN_POINTS = 4
-"""Points in the tissue from which on they tell the direction of the edge."""
 
 
 class Pull(NamedTuple):
@@ -106,7 +111,7 @@ def follow_device(edge, strips, device, moved, tissue, law):
         tissue: `Tissue`.
         law: `Law`.
     """
-    direction, piece = _direction(device)
+    direction, piece = edge_direction(device)
     lag_behind(edge, device)
     immerse(edge, device, tissue)
     paid, rubbed, swept, limit = 0.0, 0.0, 0.0, -1.0
@@ -115,7 +120,7 @@ def follow_device(edge, strips, device, moved, tissue, law):
         strips.counts[0], strips.counts[1], edge.running[0], edge.running[1] = 0, 0, 0.0, 0.0
         return no_pull()
     law = _law_now(law, rest_length(edge, tissue))
-    low, high = _box(edge, device)
+    low, high = edge_box(edge, device)
     faces = faces_near(tissue.positions, tissue.opened, strips, low, high, direction)
     fresh, limits = np.empty(POINTS, np.bool_), np.empty(POINTS)
     blade = Held(direction, facing, piece, np.zeros(POINTS))
@@ -130,29 +135,29 @@ def follow_device(edge, strips, device, moved, tissue, law):
         after = edge.points.copy()
         immerse(edge, device, tissue)
         shares_inside(edge, tissue, points, after, spans, shares)
-        cut = _shared(shares, costs, 0)
+        cut = weighted_sum(shares, costs[:, 0])
         if law.crack > 0.0:
             cut *= note_run(edge, points, places, tissue, fresh)
-        paid, rubbed = paid + cut, rubbed + _shared(shares, costs, 1)
-        swept += _shared(shares, costs, 2)
+        paid, rubbed = paid + cut, rubbed + weighted_sum(shares, costs[:, 1])
+        swept += weighted_sum(shares, costs[:, 2])
         if sum_of(edge.spans) == 0.0:
             break
-    ways, arms = differences(device, edge.points), np.empty((POINTS, 1))
+    ways, arms = differences(device, edge.points), np.empty(POINTS)
     for i in range(POINTS):
-        arms[i, 0] = SHARES[i] * (POINTS * piece)
-    middle = _shared(edge.spans, arms, 0) / max(sum_of(edge.spans), TINY)
+        arms[i] = SHARES[i] * (POINTS * piece)
+    middle = weighted_sum(edge.spans, arms) / max(sum_of(edge.spans), TINY)
     if limit < 0.0:
         _resist(edge, ways.copy(), faces, blade, law, fresh, limits)
     half = next_tooth(edge, ways, fresh, limits, piece, law).half
     held = hold(edge, ways, blade, law, limits)
-    limit, torque_limit = sum_of(limits) + half, _shared(limits, arms, 0) + half * middle
+    limit, torque_limit = sum_of(limits) + half, weighted_sum(limits, arms) + half * middle
     most = limits.copy()
     # As it is pulled now, or will be if the device moves on.
     _resist(edge, moved.copy(), faces, blade, law, fresh, limits)
     half = next_tooth(edge, moved, fresh, limits, piece, law).half
     hold(edge, ways, blade, law, limits)
     limit = max(limit, sum_of(limits) + half)
-    torque_limit = max(torque_limit, _shared(limits, arms, 0) + half * middle)
+    torque_limit = max(torque_limit, weighted_sum(limits, arms) + half * middle)
     for i in range(POINTS):
         most[i] = max(most[i], limits[i])
     scale = limit / max(sum_of(most), TINY)
@@ -168,11 +173,11 @@ def follow_device(edge, strips, device, moved, tissue, law):
                 pull[c] += edge.spans[i] * held_back * facing[c]
             force[c] += pull[c]
             forces[i, c] = pull[c]
-            arm[c] = arms[i, 0] * direction[c]
+            arm[c] = arms[i] * direction[c]
         cross(arm, pull, turn)
         for c in range(3):
             torque[c] += turn[c]
-    line, mean = _line(edge.spans, ways)
+    line, mean = edge_line(edge.spans, ways)
     lag = norm(mean)
     return Pull(
         force, torque, limit, torque_limit, line, lag, paid, rubbed, swept, held, forces, most
@@ -198,7 +203,7 @@ def carry_edge(edge, strips, device, moved, positions, law):
         Motion of tip and root relative to the tip with the tissue [m], shape (2, 3), and the work
         of friction [J].
     """
-    direction, piece = _direction(device)
+    direction, piece = edge_direction(device)
     deeper = 0.0
     if edge.spans[0] > 0.0:
         deeper = law.at_tip[edge.region[0]] / edge.spans.sum() / law.stiffness
@@ -211,8 +216,8 @@ def carry_edge(edge, strips, device, moved, positions, law):
         for k in range(4):
             for c in range(3):
                 carried[c] += edge.weights[i, k] * positions[edge.corners[i, k], c]
-        held, pulled = _split(device[i] - edge.points[i], direction)
-        sliced, pushed = _split(moved[i], direction)
+        held, pulled = split_way(device[i] - edge.points[i], direction)
+        sliced, pushed = split_way(moved[i], direction)
         ratio = sliced / pushed if pushed > 0.0 else 0.0
         grip = law.friction[edge.region[i]] * piece / law.stiffness
         most = max(max(held, grip), ratio * pulled)
@@ -221,9 +226,9 @@ def carry_edge(edge, strips, device, moved, positions, law):
         rubbed += 0.5 * law.stiffness * edge.spans[i] * (stretch**2 - kept**2)
         ways[i] = carried - edge.points[i]
         edge.points[i] = carried + (stretch - kept) * direction
-    line, _ = _line(edge.spans, ways)
+    line, _ = edge_line(edge.spans, ways)
     for k in range(KNOTS):
-        share = min(max(SHARES[_KNOTS[k]], SHARES[first]), SHARES[last])
+        share = min(max(SHARES[KNOT_POINTS[k]], SHARES[first]), SHARES[last])
         way = line[0] + share * line[1]
         way -= dot(way, direction) * direction
         for s in range(strips.counts[0]):
@@ -259,15 +264,6 @@ def gather_loads(edge, loads):
 
 
 @inner
-def _shared(shares, values, column):
-    """Return the sum of a column of values, shape (n, k), each times its share."""
-    total = 0.0
-    for i in range(len(shares)):
-        total += shares[i] * values[i, column]
-    return total
-
-
-@inner
 def _law_now(law, longer):
     """Return the law with toughness by area now, where the edge is longer at rest by a factor."""
     toughness = longer * law.toughness
@@ -281,54 +277,6 @@ def _law_now(law, longer):
         law.crack,
         law.rigidity,
     )
-
-
-@inner
-def _split(way, direction):
-    """Return the lengths of a way along a direction and across it [m]."""
-    along, square = dot(way, direction), 0.0
-    for c in range(3):
-        square += (way[c] - along * direction[c]) ** 2
-    return abs(along), np.sqrt(square)
-
-
-@inner
-def _direction(device):
-    """Return the unit vector from tip to root, and the length that a point stands for [m]."""
-    edge = np.empty(3)
-    for c in range(3):
-        edge[c] = device[POINTS - 1, c] - device[0, c]
-    length = norm(edge)
-    for c in range(3):
-        edge[c] /= length
-    return edge, length / (POINTS - 1)
-
-
-@inner
-def _box(edge, device):
-    """Return a box around the edge and the device's, where they are in the tissue [m], (3,)."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for i in range(POINTS):
-        if edge.spans[i] > 0.0:
-            for c in range(3):
-                x, y = edge.points[i, c], device[i, c]
-                low[c], high[c] = min(low[c], min(x, y)), max(high[c], max(x, y))
-    for c in range(3):
-        low[c], high[c] = low[c] - BLADE_THICKNESS, high[c] + BLADE_THICKNESS
-    return low, high
-
-
-@inner
-def _knots(edge, device):
-    """Return some points of the edge, half a piece more at its ends [m], shape (KNOTS, 3)."""
-    knots = np.empty((KNOTS, 3))
-    for c in range(3):
-        for k in range(KNOTS):
-            knots[k, c] = edge.points[_KNOTS[k], c]
-        half = (device[1, c] - device[0, c]) / 2
-        knots[0, c] -= half
-        knots[KNOTS - 1, c] += half
-    return knots
 
 
 @inner
@@ -366,7 +314,7 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits, costs):
         return sum_of(limits)
     if law.crack > 0.0:
         bound_run(edge, slid, ways, fresh)
-    knots = _knots(edge, device)
+    knots = edge_knots(edge, device)
     costs[:] = 0.0
     for i in range(POINTS):
         if edge.spans[i] > 0.0:
@@ -375,11 +323,11 @@ def _slip(edge, strips, device, faces, blade, law, fresh, limits, costs):
             for c in range(3):
                 edge.points[i, c] += ways[i, c]
             if fresh[i]:
-                area = blade.piece * edge.spans[i] * _split(ways[i], blade.direction)[1]
+                area = blade.piece * edge.spans[i] * split_way(ways[i], blade.direction)[1]
                 costs[i, 2] = area
     lag_behind(edge, device)
     if cutting:
-        add_strip(strips, knots, _knots(edge, device))
+        add_strip(strips, knots, edge_knots(edge, device))
     else:
         strips.counts[1] = 0
     return -1.0
@@ -433,39 +381,3 @@ def _is_tip_fresh(edge, blade, faces):
         before[0, c] = edge.points[0, c] - (blade.piece / 2 + _BEYOND) * blade.direction[c]
         way[0, c] = -blade.direction[c]
     return look_ahead(before, way, 0, faces)
-
-
-@inner
-def _line(spans, values):
-    """Return the line a + s b nearest to values at the points' places s, and their mean.
-
-    It is level where too few points are in the tissue.
-
-    Args:
-        spans: `Edge.spans`, shape (POINTS,).
-        values: shape (POINTS, 3).
-
-    Returns:
-        a and b, shape (2, 3), and the mean, shape (3,).
-    """
-    count, mean, middle = 0, np.zeros(3), 0.0
-    line, square = np.zeros((2, 3)), 0.0
-    for i in range(POINTS):
-        if spans[i] > 0.0:
-            count += 1
-            middle += SHARES[i]
-            for c in range(3):
-                mean[c] += values[i, c]
-    if count == 0:
-        return line, mean
-    middle /= count
-    for i in range(POINTS):
-        if spans[i] > 0.0:
-            square += (SHARES[i] - middle) ** 2
-            for c in range(3):
-                line[1, c] += (SHARES[i] - middle) * values[i, c]
-    for c in range(3):
-        mean[c] /= count
-        line[1, c] = line[1, c] / square if count >= _MIN_POINTS else 0.0
-        line[0, c] = mean[c] - middle * line[1, c]
-    return line, mean

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cutting_trainer.node_common.kernels import inner, kernel
+from cutting_trainer.node_common.vectors import area_vector, norm
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta, Touched, carried_over
 from cutting_trainer.tissue_sim.mesh.topology import Links
 
@@ -175,7 +176,7 @@ def _spread(
     while done < count:
         triangle = links.triangles[queue[done]]
         done += 1
-        area = _area_vector(rest, triangle, normal)
+        area = _unit_normal(rest, triangle, normal)
         facing = normal[0] * outward[0] + normal[1] * outward[1] + normal[2] * outward[2]
         if area == 0.0 or facing <= 0.0:
             continue
@@ -218,13 +219,13 @@ def _begin(links, rest, nodes, known, queue, outward):
     normal = np.empty(3)
     for i in range(listed):
         triangle = links.triangles[queue[i]]
-        if shared[i] == most and _area_vector(rest, triangle, normal) > 0.0:
+        if shared[i] == most and _unit_normal(rest, triangle, normal) > 0.0:
             outward += normal
             queue[count] = queue[i]
             count += 1
     for i in range(count):
         known[queue[i]] = True
-    size = np.sqrt(outward[0] ** 2 + outward[1] ** 2 + outward[2] ** 2)
+    size = norm(outward)
     if size > 0.0:
         outward /= size
     return count
@@ -247,13 +248,11 @@ def _list_triangles(links, node, known, queue, count):
 
 
 @inner
-def _area_vector(rest, triangle, normal):
+def _unit_normal(rest, triangle, normal):
     """Write the outward unit normal of a triangle; return its area [m^2], 0 for a sliver."""
     a, b, c = rest[triangle[0]], rest[triangle[1]], rest[triangle[2]]
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        normal[i] = (b[j] - a[j]) * (c[k] - a[k]) - (b[k] - a[k]) * (c[j] - a[j])
-    size = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    area_vector(a, b, c, normal)
+    size = norm(normal)
     if size < 1e-18:
         return 0.0
     normal /= size
