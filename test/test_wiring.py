@@ -112,7 +112,9 @@ def test_a_state_of_another_type_is_a_cause_with_what_to_install(graph):
     graph.hear('driver')
     driver = graph.node('dvrk', '/console')
     driver.create_publisher(String, '/left/arm/operating_state', EVENTS)
-    graph.settle(lambda: graph._bridge.count_publishers('arm/operating_state'))
+    # The name of a node is known some time after its publisher.
+    publishers = graph._bridge.get_publishers_info_by_topic
+    graph.settle(lambda: any(p.node_name == 'dvrk' for p in publishers('arm/operating_state')))
     cause = graph.wiring.cause()
     assert '/left/arm/operating_state comes from /console/dvrk as std_msgs/msg/String' in cause
     assert './trainer overlay' in cause
