@@ -183,6 +183,11 @@ class Study(SceneModel):
         default=None, description='bags of scored attempts: exercise, subject, folder'
     )
     settings: Designs = Field(description='designs: grid, cases, latin_hypercube, sobol')
+    reference: dict[SceneKey, JsonValue] | None = Field(
+        default=None,
+        description='setting whose force all others are compared with, values by dotted scene key; '
+        'absent: the recorded force',
+    )
     outputs: list[OutputName] = Field(
         default=list(OUTPUTS), min_length=1, description='columns of the table'
     )
@@ -209,24 +214,25 @@ def read_study(path: Path) -> Study:
 def _wrong_values(study: Study) -> list[ErrorDetails]:
     """Return an error for each value of a setting that its scene key cannot have."""
     return [
-        ErrorDetails(type='value_error', loc=('settings', *place), msg=said, input=value,
-                     ctx={'error': said})
-        for place, key, value in _values(study.settings)
+        ErrorDetails(type='value_error', loc=place, msg=said, input=value, ctx={'error': said})
+        for place, key, value in _values(study)
         if (said := _refusal(key, value, sampled='ranges' in place))
-    ]  # fmt: skip
+    ]
 
 
-def _values(designs: Designs) -> Iterator[tuple[tuple[int | str, ...], str, JsonValue]]:
-    """Yield the place below `settings`, the scene key and the value of all that is set."""
+def _values(study: Study) -> Iterator[tuple[tuple[int | str, ...], str, JsonValue]]:
+    """Yield the place in the file, the scene key and the value of all that is set."""
+    yield from ((('reference', key), key, value) for key, value in (study.reference or {}).items())
+    designs, section = study.settings, 'settings'
     for key, values in designs.grid.items():
-        yield from ((('grid', key, i), key, value) for i, value in enumerate(values))
+        yield from (((section, 'grid', key, i), key, value) for i, value in enumerate(values))
     for i, case in enumerate(designs.cases):
-        yield from ((('cases', i, key), key, value) for key, value in case.items())
+        yield from (((section, 'cases', i, key), key, value) for key, value in case.items())
     for name in ('latin_hypercube', 'sobol'):
         sampled: Sampled | None = getattr(designs, name)
         for key, within in sampled.ranges.items() if sampled else ():
             for end in ('low', 'high'):
-                yield (name, 'ranges', key, end), key, getattr(within, end)
+                yield (section, name, 'ranges', key, end), key, getattr(within, end)
 
 
 def _refusal(key: str, value: JsonValue, *, sampled: bool) -> str:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 from scipy.stats import qmc
 
-from cutting_trainer.studies.description import Designs, Range, Sampled, Sobol
+from cutting_trainer.studies.description import Designs, Range, Sampled, Sobol, Study
 
 _DIGITS = 6
 """Significant digits of a sampled value: it is read by people, too."""
@@ -63,18 +63,19 @@ class Setting:
 
 
 RECORDED = Setting(0, {})
-"""The session as recorded: the reference of all others."""
+"""The session as recorded: setting 0."""
 
 
-def settings_of(designs: Designs, folder: Path = Path()) -> list[Setting]:
-    """Return the settings of all designs, each once, in the order of the study file.
+def settings_of(study: Study, folder: Path = Path()) -> list[Setting]:
+    """Return the settings of a study, each once: its reference, if there is one, then its designs.
 
     Args:
-        designs: of the study.
+        study: as read.
         folder: of the study file, to which a mesh is relative.
     """
     found, folder = dict[str, Setting](), folder.resolve()
-    for changes in _all_changes(designs):
+    reference = [] if study.reference is None else [study.reference]
+    for changes in chain(reference, _all_changes(study.settings)):
         mesh = changes.get(MESH_KEY)
         if isinstance(mesh, str):
             changes = {**changes, MESH_KEY: str(folder / mesh)}

@@ -1,5 +1,6 @@
 """One row of a study, computed by a worker: a bag under a setting."""
 
+import json
 import tempfile
 import time
 import traceback
@@ -42,10 +43,13 @@ from cutting_trainer.recordings.what_if import (
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.studies.bag_collection import hash_of_bag
-from cutting_trainer.studies.designs import Setting
+from cutting_trainer.studies.designs import RECORDED, Setting
 from cutting_trainer.studies.identity import Identity, identity_of_worker
 from cutting_trainer.studies.outputs import outputs_of
+from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
+
+Floats = NDArray[np.float64]
 
 
 class UnavailableError(RuntimeError):
@@ -71,6 +75,7 @@ class Job:
         setting: changes of the scene.
         identity: code of whoever asks; a worker with other code refuses.
         series: the force over time is wanted, too.
+        reference: setting whose force this one is compared with.
     """
 
     bag: str
@@ -78,6 +83,7 @@ class Job:
     setting: Setting
     identity: Identity
     series: bool = False
+    reference: Setting = RECORDED
 
 
 @dataclass(frozen=True)
@@ -90,11 +96,12 @@ class Result:
         differs_from_frame: of the session as recorded, the first frame that was computed otherwise
             than recorded; 0: none.
         identity: code and machine that computed it.
-        cpu: processor time of the row [s], without the warm-up of a new worker.
-        warm_up: processor time of that [s]; 0 for all but its first row.
+        cpu: processor time of the row [s], without the warm-up of a new worker and the reference.
+        warm_up: processor time of that, and of the reference, where this row was the first [s].
         memory: largest resident memory of the worker so far [bytes].
         lost: no worker has computed it, for a reason that is not that of bag or setting.
         series: force on the hand at each pose [N], shape (n, 3), where the job asks for it.
+        reference: identity of the setting that it is compared with.
     """
 
     outputs: dict[str, float]
@@ -105,7 +112,8 @@ class Result:
     warm_up: float
     memory: int
     lost: bool = False
-    series: NDArray[np.float64] | None = None
+    series: Floats | None = None
+    reference: str = ''
 
 
 class OtherCodeError(RuntimeError):
@@ -147,7 +155,12 @@ def evaluate(job: Job) -> Result:
     lost, series = False, None
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
-            outputs, differs, run = _compute(job, Path(temporary))
+            reference = _reference_forces(job) if job.reference.number else None
+            warm = time.thread_time()
+            run, mesh, differs = _compute(job.bag, job.bag_hash, job.setting, Path(temporary))
+            if reference is None:
+                reference = read_recording(job.bag, job.bag_hash).felt.forces
+            outputs = outputs_of(run, reference, mesh)
             series = run.vectors if job.series else None
         except Exception as error:  # a row with its reason: the study goes on
             failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
@@ -162,6 +175,7 @@ def evaluate(job: Job) -> Result:
         memory=_largest_memory(),
         lost=lost,
         series=series,
+        reference=job.reference.identity,
     )
 
 
@@ -188,22 +202,45 @@ def warm_up() -> None:
     warm_up_force_path(ToolSettings(), device, HapticsSettings(), device.load_profile())
 
 
-def _compute(job: Job, folder: Path) -> tuple[dict[str, float], int, Run]:
-    """Return the outputs of a row, the first frame that differs from the recording, and the run."""
-    recording = read_recording(job.bag, job.bag_hash)
+def _reference_forces(job: Job) -> Floats:
+    """Return the norm of the force under the reference of a row [N], shape (n,)."""
+    return _forces_under(json.dumps(job.reference.changes), job.bag, job.bag_hash)
+
+
+@lru_cache(maxsize=_KEPT_BAGS)
+def _forces_under(changes: str, bag: str, bag_hash: str) -> Floats:
+    setting = Setting(1, json.loads(changes))
+    with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
+        try:
+            run, _, _ = _compute(bag, bag_hash, setting, Path(temporary))
+        except _PASSING:
+            raise
+        except Exception as error:
+            said = _reason(error).replace(f'{temporary}/', '')
+            raise SessionError(f'the reference: {said}') from error
+    return run.forces
+
+
+def _compute(
+    folder: str, bag_hash: str, setting: Setting, temporary: Path
+) -> tuple[Run, TetMesh, int]:
+    """Return a session under a setting, its tissue at the end, and of a session as recorded the
+    first frame that differs from the recording; 0: there is none.
+    """
+    recording = read_recording(folder, bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
-    if (mesh := job.setting.mesh) is not None:
-        _require(mesh)
-    scene = load_scene(str(restore_scene(bag, folder, job.setting.in_yaml)))
-    changed, differs = job.setting.number > 0, None
-    refuse_lost_changes(bag, job.setting.changes)
+    if setting.mesh is not None:
+        _require(setting.mesh)
+    scene = load_scene(str(restore_scene(bag, temporary, setting.in_yaml)))
+    changed, differs = setting.number > 0, None
+    refuse_lost_changes(bag, setting.changes)
     computed = recomputation(scene, beginning, changed=changed)
     if changed:
         run = move_hand(recording.records, recording.poses, recording.indexings, scene, computed)
     else:
         differs = recompute(recording.records, computed)
         run = as_felt(felt, computed)
-    return outputs_of(run, felt.forces, computed.simulation.mesh), differs or 0, run
+    return run, computed.simulation.mesh, differs or 0
 
 
 @lru_cache(maxsize=_KEPT_BAGS)

@@ -32,7 +32,7 @@ class Journal:
     Attributes:
         path: the file.
         rows: results by key; those of other code are not among them.
-        outdated: keys of rows that only other code has computed.
+        outdated: keys of rows that only other code has computed, or beside another reference.
     """
 
     path: Path
@@ -61,12 +61,13 @@ class Journal:
 
 
 @contextlib.contextmanager
-def open_journal(folder: Path, here: Identity) -> Iterator[Journal]:
+def open_journal(folder: Path, here: Identity, reference: str = '') -> Iterator[Journal]:
     """Open the journal of a folder of results, after removing a line that was cut off.
 
     Args:
         folder: exists.
         here: code whose rows count.
+        reference: identity of the setting with which they are compared.
 
     Raises:
         SessionError: another process writes it, or it is no journal.
@@ -88,7 +89,7 @@ def open_journal(folder: Path, here: Identity) -> Iterator[Journal]:
         outdated: set[Key] = set()
         for number, line in enumerate(whole.splitlines(), start=1):
             key, result = _row(line, path, number)
-            if here.differences(result.identity):
+            if here.differences(result.identity) or result.reference != reference:
                 outdated.add(key)
             else:
                 rows[key] = result

@@ -27,8 +27,8 @@ class Output:
 OUTPUTS = {
     'largest_force': Output('N', 'largest force on the hand'),
     'mean_force_in_contact': Output('N', 'mean force on the hand in contact'),
-    'force_rms_difference': Output('N', 'rms difference to the recorded force on the hand'),
-    'largest_force_difference': Output('N', 'largest difference to the recorded force'),
+    'force_rms_difference': Output('N', 'rms difference to the force of the reference'),
+    'largest_force_difference': Output('N', 'largest difference to the force of the reference'),
     'contact': Output('s', 'time in contact'),
     'incision_area': Output('m^2', 'area of the incision, one side, at rest'),
     'incision_length': Output('m', 'length of the incision on the surface, at rest'),
@@ -41,15 +41,15 @@ OUTPUTS = {
 """All outputs by column."""
 
 
-def outputs_of(run: Run, recorded: NDArray[np.float64], mesh: TetMesh) -> dict[str, float]:
+def outputs_of(run: Run, reference: NDArray[np.float64], mesh: TetMesh) -> dict[str, float]:
     """Compute all outputs of a session.
 
     Args:
         run: the session.
-        recorded: norm of the recorded force on the hand at each tick [N], shape (n,).
+        reference: norm of the force that it is compared with at each tick [N], shape (n,).
         mesh: tissue at the end.
     """
-    off = np.abs(run.forces - recorded)
+    off = np.abs(run.forces - reference)
     values = run.figures() | {
         'force_rms_difference': float(np.sqrt(np.mean(off**2))),
         'largest_force_difference': float(off.max(initial=0.0)),

@@ -85,12 +85,14 @@ class Plan:
     """Rows of a study, done or not.
 
     Attributes:
+        reference: setting whose force the others are compared with.
         lost: results that no worker could compute this time, by key.
     """
 
     study: Study
     bags: list[StudyBag]
     settings: list[Setting]
+    reference: Setting
     journal: Journal
     lost: dict[tuple[str, str], Result]
 
@@ -103,7 +105,7 @@ class Plan:
         """Return the rows to be computed, bag by bag, the session as recorded first."""
         here = identity_of_worker()
         return [
-            Job(str(bag.path), bag.hash, setting, here)
+            Job(str(bag.path), bag.hash, setting, here, reference=self.reference)
             for bag in self.bags
             for setting in self.settings
             if key_of(bag.hash, setting) not in self.journal.rows
@@ -141,14 +143,15 @@ def run_study(options: StudyOptions) -> Status:
     notes = Console(stderr=True, soft_wrap=True)
     beside = options.file.resolve().parent
     bags = bags_of(study, beside, notes)
-    settings = [RECORDED, *settings_of(study.settings, beside)]
+    settings = [RECORDED, *settings_of(study, beside)]
+    reference = settings[1] if study.reference is not None else RECORDED
     if not options.folder.parent.is_dir() or options.folder.is_file():
         raise SessionError(
             f'{options.folder} cannot be made: name a folder with --output in one that exists'
         )
     options.folder.mkdir(exist_ok=True)
-    with open_journal(options.folder, identity_of_worker()) as journal:
-        plan = Plan(study, bags, settings, journal, {})
+    with open_journal(options.folder, identity_of_worker(), reference.identity) as journal:
+        plan = Plan(study, bags, settings, reference, journal, {})
         interrupted = not _compute(plan, options, notes)
         _write_tables(options.folder, plan)
         rows = plan.rows()
@@ -183,8 +186,8 @@ def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
     wanted = {key_of(job.bag_hash, job.setting) for job in jobs}
     if outdated := len(plan.journal.outdated & wanted):
         notes.print(
-            f'{outdated} rows of {escape(str(options.folder))} are of other code or libraries, and '
-            'are computed again',
+            f'{outdated} rows of {escape(str(options.folder))} are of other code or libraries, or '
+            'beside another reference, and are computed again',
             highlight=False,
         )
     if not jobs:
@@ -288,6 +291,7 @@ def _tell(options: StudyOptions, plan: Plan, rows: list[Row], summary: StudySumm
             'rows': len(rows),
             'planned': plan.size,
             'failures': summary.failures,
+            'tradeoffs': [without_nan(one) for one in summary.tradeoffs],
             'effects': [without_nan(effect) for effect in summary.settings],
             'effects_of_keys': [without_nan(effect) for effect in summary.keys],
             'notes': summary.notes,

@@ -1,4 +1,4 @@
-"""Summary of a study, as text and as a page with one plot."""
+"""Summary of a study, as text and as a page with plots."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -17,6 +17,14 @@ from rich.table import Table
 
 from cutting_trainer.recordings.html_page import image, page, table
 from cutting_trainer.recordings.picture import STYLE
+from cutting_trainer.studies.accuracy_and_cost import (
+    HEAD,
+    MEANING,
+    NARROW,
+    Tradeoff,
+    tradeoff_figure,
+    tradeoffs,
+)
 from cutting_trainer.studies.description import Study
 from cutting_trainer.studies.effects import (
     MIN_BAGS,
@@ -44,6 +52,7 @@ class StudySummary:
 
     Attributes:
         settings, keys: effects that are not zero in all bags.
+        tradeoffs: error and cost of each setting, where the study has a reference.
         unchanged: outputs that no setting changes in any bag.
         failures: number of rows by reason.
         notes: sentences.
@@ -51,6 +60,7 @@ class StudySummary:
 
     settings: list[Effect]
     keys: list[Effect]
+    tradeoffs: list[Tradeoff]
     unchanged: list[str]
     failures: dict[str, int]
     notes: list[str] = field(default_factory=list)
@@ -65,7 +75,8 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
         planned: number of rows of the whole study.
     """
     every = effects_of_settings(rows, study.outputs, study.confidence)
-    keys, why_not = effects_of_keys(rows, study.outputs, study.confidence)
+    designed = [row for row in rows if not row.is_reference]
+    keys, why_not = effects_of_keys(designed, study.outputs, study.confidence)
     settings = [effect for effect in every if not effect.is_zero]
     changed = {effect.output for effect in settings}
     failures = Counter(row.result.failure for row in rows if row.result.failure)
@@ -94,6 +105,7 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
     return StudySummary(
         settings=_by_output(settings, study.outputs),
         keys=_by_output([effect for effect in keys if effect.output in changed], study.outputs),
+        tradeoffs=tradeoffs(rows, study.confidence),
         unchanged=[name for name in study.outputs if name not in changed and every],
         failures=dict(failures.most_common()),
         notes=notes,
@@ -107,6 +119,13 @@ def _by_output(effects: Iterable[Effect], outputs: list[str]) -> list[Effect]:
 def as_text(summary: StudySummary) -> Group:
     """Return a summary for the terminal: effects of settings, or of keys if there are many."""
     parts: list[Any] = []
+    if summary.tradeoffs:
+        beside = Table(box=box.SIMPLE_HEAD)
+        for number, name in enumerate(HEAD[:NARROW]):
+            beside.add_column(name, justify='right' if number else 'left', overflow='fold')
+        for one in summary.tradeoffs[:MAX_LINES]:
+            beside.add_row(*map(escape_markup, one.cells[:NARROW]))
+        parts += [beside, MEANING]
     few = len({effect.cause for effect in summary.settings}) <= _MAX_CAUSES
     effects = summary.settings if few or not summary.keys else summary.keys
     shown = Table(box=box.SIMPLE_HEAD)
@@ -141,6 +160,10 @@ def write_page(file: Path, title: str, summary: StudySummary) -> None:
         if figure is not None:
             caption = 'Change of each output, and its confidence interval over bags.'
             parts.append(image(figure, caption))
+        if (figure := tradeoff_figure(summary.tradeoffs)) is not None:
+            parts += ['<h2>Accuracy and cost</h2>', image(figure, MEANING)]
+            numbered = enumerate(summary.tradeoffs, start=1)
+            parts.append(table([(str(n), *one.cells) for n, one in numbered], ('', *HEAD)))
     for heading, effects in _sections(summary):
         parts += [f'<h2>{escape(heading)}</h2>', table([_cells(e) for e in effects], _HEAD)]
     parts += [f'<p class="note">{escape(text)}</p>' for text in _sentences(summary)]

@@ -25,6 +25,11 @@ class Row:
     result: Result
 
     @property
+    def is_reference(self) -> bool:
+        """Whether it is that of the setting whose force the others are compared with."""
+        return self.setting.number > 0 and self.setting.identity == self.result.reference
+
+    @property
     def head(self) -> dict[str, object]:
         """Columns that name the row."""
         return {
@@ -61,6 +66,7 @@ def write_table(file: Path, rows: Sequence[Row], outputs: Iterable[str]) -> None
     for name in outputs:
         types[name] = pa.float64()
         columns[name] = [row.result.outputs.get(name) for row in rows]
+    columns['reference'] = [row.result.reference for row in rows]
     columns['failure'] = [row.result.failure for row in rows]
     types['differs_from_frame'] = pa.int64()
     columns['differs_from_frame'] = [

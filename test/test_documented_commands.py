@@ -180,6 +180,9 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer study config/studies/toughness.yaml -o bags/sessions/toughness': Nowhere(
         'takes a minute, and ten bags: test_studies_on_dask.py computes another study'
     ),
+    './trainer study config/studies/models.yaml -o bags/sessions/models': Nowhere(
+        'takes two minutes, and ten bags: test_studies.py computes rows beside another reference'
+    ),
     './trainer identify bags/sessions/study -o bags/sessions/identified': Nowhere(
         'takes minutes, and ten bags: test_identification.py identifies another one'
     ),

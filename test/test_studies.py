@@ -16,8 +16,9 @@ from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.session.attempts import open_store
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies import evaluation
+from cutting_trainer.studies.accuracy_and_cost import tradeoff_figure, tradeoffs
 from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find_bags, hash_of_bag
-from cutting_trainer.studies.description import Designs, Study, read_study
+from cutting_trainer.studies.description import Study, read_study
 from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings, interval
 from cutting_trainer.studies.evaluation import Job, Result
@@ -78,9 +79,20 @@ BAD_EDITS = [
     ),
     ('key in a list', 'cutting.method', 'tissue.regions.toughness', 5, ['give the whole list']),
     ('mesh that is none', '[100, 200]', '[100, 200]\n    tissue.mesh: [3]', 5, ['is no path']),
+    (
+        'reference that is none',
+        'outputs:',
+        'reference: {tissue.model: linaer}\noutputs:',
+        10,
+        ['reference.tissue.model', 'linaer', "'linear'"],
+    ),
     ('end of a range', 'high: 400', 'high: 1e7', 9, ['high', '100000']),
     ('no YAML', 'bags: [bags]', 'bags: [bags', 2, ['not valid YAML']),
 ]
+
+
+def designed(designs: dict[str, object]) -> Study:
+    return Study.model_validate({'bags': ['bags'], 'settings': designs})
 
 
 def study(tmp_path: Path, text: str) -> Study:
@@ -104,6 +116,13 @@ def test_bad_study_file_gives_one_sentence_with_its_place(
     assert all(words in sentence for words in said), sentence
 
 
+@pytest.mark.parametrize(
+    'file', sorted((ROOT / 'config' / 'studies').glob('*.yaml')), ids=lambda file: file.stem
+)
+def test_a_shipped_study_has_settings(file: Path) -> None:
+    assert len(settings_of(read_study(file), file.parent)) > 5
+
+
 @pytest.mark.parametrize('designs', ['{}', '{grid: {}}', '{cases: []}'])
 def test_study_file_without_a_design_names_the_designs(tmp_path: Path, designs: str) -> None:
     with pytest.raises(SceneError, match='there is no design: give grid, cases'):
@@ -119,7 +138,7 @@ def test_an_mcap_file_in_place_of_its_bag_is_named(tmp_path: Path) -> None:
 
 def test_settings_are_those_of_all_designs_each_once(tmp_path: Path) -> None:
     text = GOOD.replace('  latin', '  cases: [{tissue.model: linear}, {}, {}]\n  latin')
-    settings = settings_of(study(tmp_path, text).settings)
+    settings = settings_of(study(tmp_path, text))
     assert [s.number for s in settings] == list(range(1, 12))
     first = {'tissue.material.toughness': 100, 'cutting.method': 'combined'}
     assert settings[0].changes == first
@@ -136,13 +155,13 @@ def test_settings_with_other_names_for_one_value_are_one_and_meshes_count_by_con
     before, after = '', ''
     for text in ('one', 'another'):
         (tmp_path / 'fine.vtk').write_text(text)
-        (setting,) = settings_of(Designs.model_validate(design), tmp_path)
+        (setting,) = settings_of(designed(design), tmp_path)
         before, after = after, setting.identity
     assert setting.changes['tissue.mesh'] == str(tmp_path / 'fine.vtk')
     assert before != after
     (tmp_path / 'moved.vtk').write_text(text)
     design['grid']['tissue.mesh'] = ['moved.vtk']
-    (setting,) = settings_of(Designs.model_validate(design), tmp_path)
+    (setting,) = settings_of(designed(design), tmp_path)
     assert setting.identity == after
 
 
@@ -193,14 +212,35 @@ def test_a_bag_out_of_reach_is_no_row(monkeypatch) -> None:
     assert not evaluation.evaluate(job).lost
 
 
+def test_a_row_is_compared_with_the_force_under_the_reference(monkeypatch) -> None:
+    monkeypatch.setattr(evaluation, 'warm_up', lambda: None)
+    (bag,) = find_bags(['palpation'], SAMPLES)
+    best, cheap = (Setting(n, {'tissue.model': m}) for n, m in ((1, 'stiffening'), (2, 'linear')))
+    asked = Job(str(bag.path), bag.hash, cheap, identity_of_worker(), series=True, reference=best)
+    one, itself, recorded = (
+        evaluation.evaluate(replace(asked, setting=s)) for s in (cheap, best, RECORDED)
+    )
+    assert not (one.failure or itself.failure or recorded.failure)
+    felt, wanted = (np.linalg.norm(of.series, axis=1) for of in (one, itself))
+    rms = np.sqrt(np.mean((felt - wanted) ** 2))
+    assert rms > 1e-3 and one.outputs['force_rms_difference'] == pytest.approx(rms, rel=1e-12)
+    assert itself.outputs['force_rms_difference'] == 0.0 and itself.reference == best.identity
+    assert recorded.outputs['force_rms_difference'] > 1e-3
+    alone = evaluation.evaluate(replace(asked, reference=RECORDED))
+    assert alone.outputs['force_rms_difference'] < rms / 2  # it was recorded by the linear model
+    never = Setting(1, {'tissue.material.youngs_modulus': -1})
+    failed = evaluation.evaluate(replace(asked, reference=never))
+    assert failed.failure.startswith('the reference: ') and 'youngs_modulus' in failed.failure
+
+
 def test_hypercube_has_one_sample_in_each_part_of_a_range_and_sobol_too(tmp_path: Path) -> None:
     text = GOOD.replace('samples: 5', 'samples: 16\n    seed: 3')
     for design in ('latin_hypercube', 'sobol'):
         made = study(tmp_path, text.replace('latin_hypercube', design))
-        values = [s.changes['tissue.material.toughness'] for s in settings_of(made.settings)[4:]]
+        values = [s.changes['tissue.material.toughness'] for s in settings_of(made)[4:]]
         shares = np.log(np.array(values, float) / 50) / np.log(400 / 50)
         assert sorted(np.floor(16 * shares)) == list(range(16))
-        assert settings_of(made.settings) == settings_of(made.settings)
+        assert settings_of(made) == settings_of(made)
 
 
 def test_bags_are_found_below_folders_and_by_globs_each_content_once(tmp_path: Path) -> None:
@@ -290,6 +330,8 @@ def test_rows_are_read_back_and_those_of_other_code_or_cut_off_are_not(tmp_path:
     with open_journal(tmp_path, here) as journal:
         assert not journal.outdated  # a row has been computed again
     assert file.read_bytes() == whole
+    with open_journal(tmp_path, here, 'of another reference') as journal:
+        assert not journal.rows and len(journal.outdated) == 3
     file.write_text('{"key": 3}\n')
     with (
         pytest.raises(SessionError, match=r'rows\.jsonl:1 is not a row'),
@@ -330,6 +372,40 @@ def test_table_has_a_type_for_each_key_and_the_same_bytes_each_time(tmp_path: Pa
     assert {'target', 'kernels', 'code', 'numpy', 'devices'} <= read.keys()
     assert 'cpu' not in read  # two models of one kind of processor compute the same bits
     write_table(tmp_path / 'none.parquet', [], ['largest_force'])  # before the first row
+
+
+# Accuracy and cost.
+
+
+def test_settings_on_the_front_have_no_rival_that_is_nearer_for_the_same_time(
+    tmp_path: Path,
+) -> None:
+    # Error [N] and time [s] of each setting; the first one is the reference.
+    given = [(0.0, 8.0), (0.4, 1.0), (0.5, 2.0), (0.1, 2.0), (0.1, 4.0), (0.2, 1.0)]
+    settings = [Setting(n, {'s.x': n}) for n in range(1, 7)]
+    rows = []
+    for n, bag in enumerate(bags(3), start=1):  # each bag lasts longer, and has more force
+        for setting, (error, time) in zip(settings, given, strict=True):
+            values = {'force_rms_difference': error, 'mean_force_in_contact': 2.0 * n}
+            made = result(0.0)
+            made = replace(made, cpu=n * time, reference=settings[0].identity)
+            rows.append(Row(bag, setting, replace(made, outputs=made.outputs | values)))
+    rows[-1] = replace(rows[-1], result=replace(rows[-1].result, failure='it diverged'))
+    found = tradeoffs(rows, 0.95)
+    assert [one.setting for one in found] == ['x=6', 'x=2', 'x=4', 'x=3', 'x=5', 'x=1']
+    assert [one.on_front for one in found] == [True, False, True, False, False, True]
+    assert [one.ratio for one in found] == [0.125, 0.125, 0.25, 0.25, 0.5, 1.0]
+    assert (found[1].error, found[1].time, found[1].bags) == (pytest.approx(0.4), 2.0, 3)
+    assert found[1].share == pytest.approx(0.4 * (1 / 2 + 1 / 4 + 1 / 6) / 3)
+    assert (found[0].bags, found[0].time) == (2, 1.5)  # a failed row counts with no bag
+    summary = summarise(rows, study(tmp_path, GOOD), len(rows))
+    write_page(tmp_path / 'page.html', 'models', summary)
+    text = (tmp_path / 'page.html').read_text()
+    assert 'Accuracy and cost' in text and 'x=4 *' in text and 'x=3 *' not in text
+    assert not tradeoffs([replace(r, result=replace(r.result, reference='')) for r in rows], 0.95)
+    only_the_best = [row for row in rows if row.setting.number in (1, 2)]
+    slow = [replace(r, result=replace(r.result, cpu=9.0 - r.setting.number)) for r in only_the_best]
+    assert tradeoff_figure(tradeoffs(slow, 0.95)) is not None
 
 
 # Effects, beside exact ones.
