@@ -35,7 +35,7 @@ def study(
 @commands.command(epilog=EXIT_STATUSES)
 def identify(
     bags: Annotated[
-        list[str], typer.Argument(help='Bags, folders with bags anywhere below, or globs.')
+        list[str], typer.Argument(help='Bags, folders with bags anywhere below, globs, or URLs.')
     ],
     output: Annotated[Path, typer.Option('--output', '-o', help='Folder of the results.')] = Path(
         'identified'

@@ -1,8 +1,8 @@
-"""Bags of a study, found by path, folder or glob."""
+"""Bags of a study, found by path, folder, glob or URL."""
 
 import glob
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,12 @@ from cutting_trainer.node_common.scene_reader import missing_file
 from cutting_trainer.recordings.attempts_command import index_bags
 from cutting_trainer.session.attempts import open_store
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.studies.remote_bags import (
+    UnavailableError,
+    bags_at,
+    copied_bag,
+    is_url,
+)
 
 _BLOCK_BYTES = 1 << 20
 _HASH_DIGITS = 16
@@ -24,20 +30,27 @@ class StudyBag:
 
     Attributes:
         name: path as the study file has it, or below the folder that it names.
-        path: absolute path.
+        path: absolute path, of the copy where the bag is at a URL.
         hash: hash of its content.
+        url: where it is; '' for a path.
     """
 
     name: str
     path: Path
     hash: str
+    url: str = ''
+
+    @property
+    def place(self) -> str:
+        """URL or path: where each worker finds it."""
+        return self.url or str(self.path)
 
 
 def find_bags(patterns: Iterable[str], folder: Path) -> list[StudyBag]:
     """Return the bags of a study, each content once, in the order of the patterns.
 
     Args:
-        patterns: bags, folders with bags anywhere below, or globs.
+        patterns: bags, folders with bags anywhere below, globs, or URLs of these.
         folder: to which relative ones are relative.
 
     Raises:
@@ -45,11 +58,32 @@ def find_bags(patterns: Iterable[str], folder: Path) -> list[StudyBag]:
     """
     found: dict[str, StudyBag] = {}
     for pattern in patterns:
-        paths = _bags_by(pattern, folder)
-        for path in paths:
-            bag = StudyBag(_name(path, folder), path, hash_of_bag(path))
+        bags = _bags_at(pattern) if is_url(pattern) else _bags_by(pattern, folder)
+        for bag in bags:
             found.setdefault(bag.hash, bag)
     return list(found.values())
+
+
+def path_of(place: str) -> Path:
+    """Return the path of a bag or a mesh; a bag at a URL is copied first.
+
+    Raises:
+        UnavailableError: it is not there.
+    """
+    if is_url(place):
+        return copied_bag(place)
+    if not Path(place).exists():
+        raise UnavailableError(f'{place} is not there on this worker: give all the same folders')
+    return Path(place)
+
+
+def _bags_at(url: str) -> Iterator[StudyBag]:
+    places = bags_at(url)
+    if not places:
+        raise SessionError(f'{url}: there is no bag, no folder with metadata.yaml or an .mcap file')
+    for place in places:
+        path = copied_bag(place)
+        yield StudyBag(place, path, hash_of_bag(path), place)
 
 
 def find_attempts(folder: Path, subject: str, exercise: str) -> tuple[list[str], list[str]]:
@@ -84,7 +118,7 @@ def find_attempts(folder: Path, subject: str, exercise: str) -> tuple[list[str],
     )
 
 
-def _bags_by(pattern: str, folder: Path) -> list[Path]:
+def _bags_by(pattern: str, folder: Path) -> Iterator[StudyBag]:
     try:
         whole = folder / Path(pattern).expanduser()
     except RuntimeError as error:  # there is no such user
@@ -103,7 +137,8 @@ def _bags_by(pattern: str, folder: Path) -> list[Path]:
         else:
             reason = missing_file(whole)
         raise SessionError(f'{pattern}: {reason}')
-    return list(dict.fromkeys(bags))
+    for bag in dict.fromkeys(bags):
+        yield StudyBag(_name(bag, folder), bag, hash_of_bag(bag))
 
 
 def _bags_below(folder: Path) -> list[Path]:

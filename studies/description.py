@@ -177,7 +177,8 @@ class Study(SceneModel):
 
     bags: Annotated[list[str], Field(min_length=1)] | None = Field(
         default=None,
-        description='bags, folders with bags anywhere below, or globs, relative to the study file',
+        description='bags, folders with bags anywhere below, or globs, relative to the study file; '
+        'or URLs of these',
     )
     attempts: Attempts | None = Field(
         default=None, description='bags of scored attempts: exercise, subject, folder'

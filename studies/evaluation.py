@@ -42,18 +42,15 @@ from cutting_trainer.recordings.what_if import (
 )
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import load_scene
-from cutting_trainer.studies.bag_collection import hash_of_bag
+from cutting_trainer.studies.bag_collection import hash_of_bag, path_of
 from cutting_trainer.studies.designs import RECORDED, Setting
 from cutting_trainer.studies.identity import Identity, identity_of_worker
 from cutting_trainer.studies.outputs import outputs_of
+from cutting_trainer.studies.remote_bags import UnavailableError
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
 
 Floats = NDArray[np.float64]
-
-
-class UnavailableError(RuntimeError):
-    """A worker cannot reach a bag or a mesh."""
 
 
 _SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError, UnavailableError)
@@ -70,7 +67,7 @@ class Job:
     """A row to be computed.
 
     Attributes:
-        bag: folder of the bag.
+        bag: folder of the bag, or its URL.
         bag_hash: hash of its content.
         setting: changes of the scene.
         identity: code of whoever asks; a worker with other code refuses.
@@ -222,15 +219,15 @@ def _forces_under(changes: str, bag: str, bag_hash: str) -> Floats:
 
 
 def _compute(
-    folder: str, bag_hash: str, setting: Setting, temporary: Path
+    place: str, bag_hash: str, setting: Setting, temporary: Path
 ) -> tuple[Run, TetMesh, int]:
     """Return a session under a setting, its tissue at the end, and of a session as recorded the
     first frame that differs from the recording; 0: there is none.
     """
-    recording = read_recording(folder, bag_hash)
+    recording = read_recording(place, bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
     if setting.mesh is not None:
-        _require(setting.mesh)
+        path_of(str(setting.mesh))
     scene = load_scene(str(restore_scene(bag, temporary, setting.in_yaml)))
     changed, differs = setting.number > 0, None
     refuse_lost_changes(bag, setting.changes)
@@ -244,26 +241,21 @@ def _compute(
 
 
 @lru_cache(maxsize=_KEPT_BAGS)
-def read_recording(folder: str, expected_hash: str) -> Recording:
+def read_recording(place: str, expected_hash: str) -> Recording:
     """Read a bag.
 
     Raises:
-        UnavailableError: its folder is not there.
+        UnavailableError: it is not there.
         BagError: it is unreadable, or another one than that of the study.
         SessionError: the bag has no poses, or no forces of the hand.
     """
-    _require(Path(folder))
-    if hash_of_bag(Path(folder)) != expected_hash:
-        raise BagError(f'{folder} is not the bag that the study was started with: it has changed')
+    folder = path_of(place)
+    if hash_of_bag(folder) != expected_hash:
+        raise BagError(f'{place} is not the bag that the study was started with: it has changed')
     bag = open_bag(folder)
     records, poses = computable_poses(bag)
     felt = recorded_force(bag, poses)
     return Recording(bag, find_beginning(bag), records, poses, recorded_indexings(bag), felt)
-
-
-def _require(path: Path) -> None:
-    if not path.exists():
-        raise UnavailableError(f'{path} is not there on this worker: give all the same folders')
 
 
 def _reason(error: Exception) -> str:

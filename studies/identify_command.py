@@ -189,7 +189,7 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
         coarse = problem.estimates
         folder = options.output.resolve()
         refined = [
-            str(write_refined(read_recording(str(bag.path), bag.hash).bag, folder, options.changes))
+            str(write_refined(read_recording(bag.place, bag.hash).bag, folder, options.changes))
             for bag in bags
         ]
         again = partial(running.compute, meshes=refined)
@@ -269,7 +269,7 @@ class _Running:
             material = {f'{_KEY}.{name}': value for name, value in pairs}
             setting = Setting(number, {**self._changes, **material, **mesh})
             keys[bag.hash, setting.identity] = key
-            jobs.append(Job(str(bag.path), bag.hash, setting, here, series=True))
+            jobs.append(Job(bag.place, bag.hash, setting, here, series=True))
         found, lost = dict[tuple[int, Point], Floats](), dict[tuple[int, Point], str]()
         for job, result in compute(self._client, jobs):
             key = keys[job.bag_hash, job.setting.identity]
@@ -294,7 +294,7 @@ class _Running:
 def _observe(bag: StudyBag, options: IdentifyOptions) -> tuple[Observation, TissueSettings]:
     """Return the recorded force of a bag, and the tissue of its scene with the changes."""
     try:
-        recording = read_recording(str(bag.path), bag.hash)
+        recording = read_recording(bag.place, bag.hash)
         refuse_lost_changes(recording.bag, options.changes)
         if options.refine and recording.beginning.tissue is not None:
             raise SessionError(

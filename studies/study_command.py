@@ -105,7 +105,7 @@ class Plan:
         """Return the rows to be computed, bag by bag, the session as recorded first."""
         here = identity_of_worker()
         return [
-            Job(str(bag.path), bag.hash, setting, here, reference=self.reference)
+            Job(bag.place, bag.hash, setting, here, reference=self.reference)
             for bag in self.bags
             for setting in self.settings
             if key_of(bag.hash, setting) not in self.journal.rows

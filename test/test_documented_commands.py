@@ -183,6 +183,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     './trainer study config/studies/models.yaml -o bags/sessions/models': Nowhere(
         'takes two minutes, and ten bags: test_studies.py computes rows beside another reference'
     ),
+    './trainer run python -m pip install paramiko': Nowhere('changes the environment'),
     './trainer identify bags/sessions/study -o bags/sessions/identified': Nowhere(
         'takes minutes, and ten bags: test_identification.py identifies another one'
     ),

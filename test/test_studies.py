@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
+from cutting_trainer.bags.errors import BagError
 from cutting_trainer.exercises.attempt_store import AttemptRow
 from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.session.attempts import open_store
@@ -21,10 +23,11 @@ from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find
 from cutting_trainer.studies.description import Study, read_study
 from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings, interval
-from cutting_trainer.studies.evaluation import Job, Result
+from cutting_trainer.studies.evaluation import Job, Result, read_recording
 from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.journal import JOURNAL_FILE, Journal, key_of, open_journal
 from cutting_trainer.studies.outputs import OUTPUTS
+from cutting_trainer.studies.remote_bags import UnavailableError
 from cutting_trainer.studies.study_command import bags_of
 from cutting_trainer.studies.summary import as_text, summarise, write_page
 from cutting_trainer.studies.table import Row, write_table
@@ -261,6 +264,57 @@ def test_bags_are_found_below_folders_and_by_globs_each_content_once(tmp_path: P
     (tmp_path / 'empty').mkdir()
     with pytest.raises(SessionError, match='there is no bag in it'):
         find_bags(['empty'], tmp_path)
+
+
+def test_bags_at_a_url_are_copied_once_and_anew_when_they_change(
+    tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    there = tmp_path / 'there'
+    for name in ('palpation', 'straight_cut'):
+        shutil.copytree(SAMPLES / name, there / 'day 1' / name)
+    (there / 'day 1' / 'palpation' / 'report.html').write_text('what is beside a bag is not of it')
+    url = f'file://{there}'
+    found = find_bags([f'{url}/', f'{url}/*/pal*'], tmp_path)
+    assert [bag.name for bag in found] == [
+        f'{url}/day 1/palpation', f'{url}/day 1/straight_cut'
+    ]  # fmt: skip
+    assert [bag.hash for bag in found] == [hash_of_bag(SAMPLES / n.path.name) for n in found]
+    kept = [(bag.path, bag.path.stat().st_mtime_ns) for bag in found]
+    assert all(path.is_relative_to(tmp_path / 'cache') for path, _ in kept)
+    assert len(list(found[0].path.iterdir())) == 2
+    again = find_bags([url], tmp_path)
+    assert [(bag.path, bag.path.stat().st_mtime_ns) for bag in again] == kept
+    first = read_recording(found[0].place, found[0].hash)
+    assert first.bag.path.parent == found[0].path and first.felt.forces.max() > 0.0
+    with (there / 'day 1' / 'palpation' / 'metadata.yaml').open('a') as file:
+        file.write('# changed\n')
+    changed, same = find_bags([url], tmp_path)
+    assert changed.hash == hash_of_bag(there / 'day 1' / 'palpation') != found[0].hash
+    assert changed.path != found[0].path and same == found[1]
+    evaluation.read_recording.cache_clear()
+    with pytest.raises(BagError, match='has changed'):
+        read_recording(found[0].place, found[0].hash)
+
+
+@pytest.mark.parametrize(
+    ('place', 'said'),
+    [
+        ('file://{}/none', r'/none: there is no bag'),
+        ('file://{}', r'there is no bag, no folder with metadata\.yaml'),
+        ('file://{}/*.x', r'there is no bag'),
+        ('nope://a/b', r'nope://a/b cannot be reached: Protocol not known: nope'),
+    ],
+)
+def test_a_url_without_bags_gives_one_sentence(place: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=said):
+        find_bags([place.format(tmp_path)], tmp_path)
+
+
+def test_a_protocol_without_its_package_names_it(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, 'paramiko', None)
+    with pytest.raises(UnavailableError, match=r'paramiko.*: add that package with `\./trainer'):
+        find_bags(['ssh://trainer.lan/bags'], tmp_path)
 
 
 def test_attempts_are_bags_by_exercise_and_subject(tmp_path: Path) -> None:

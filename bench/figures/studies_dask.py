@@ -42,7 +42,7 @@ def _scaling() -> list[Figure]:
     (bag,) = find_bags(['palpation'], SAMPLES)
     here = identity_of_worker()
     jobs = [
-        Job(str(bag.path), bag.hash, Setting(i, {'tissue.material.toughness': 20.0 + i}), here)
+        Job(bag.place, bag.hash, Setting(i, {'tissue.material.toughness': 20.0 + i}), here)
         for i in range(1, TIMED_ROWS + 1)
     ]
     evaluate(jobs[0])  # this process is warm now

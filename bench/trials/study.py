@@ -116,7 +116,7 @@ def _warm_cpu(folder: Path) -> dict[str, float]:
     here, key = identity_of_worker(), 'tissue.material.toughness'
     found = {}
     for bag in find_bags(['bags'], folder):
-        jobs = [Job(str(bag.path), bag.hash, Setting(i, {key: 5.0 + i}), here) for i in range(2)]
+        jobs = [Job(bag.place, bag.hash, Setting(i, {key: 5.0 + i}), here) for i in range(2)]
         evaluate(jobs[0])
         found[bag.hash] = evaluate(jobs[1]).cpu
     return found
