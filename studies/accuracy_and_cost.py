@@ -1,7 +1,7 @@
 """Accuracy against cost: the error of the force under each setting, beside its processor time.
 
 The error is the difference to the force under the reference of the study. A setting is on the front
-if no other one has a smaller error for the same time or less.
+if no other one beats it: none has a smaller error, or the same one, in the same time or less.
 """
 
 from collections.abc import Sequence
@@ -10,20 +10,19 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from cutting_trainer.studies.designs import short_names
 from cutting_trainer.studies.effects import interval
 from cutting_trainer.studies.table import Row
 
-HEAD = ('setting', 'error [N]', 'share', 'time [s]', 'ratio', 'interval [N]', 'bags')
+HEAD = ('setting', 'error [N]', 'share', 'time [s]', 'ratio', 'bags', 'interval [N]')
 """Columns of `cells`."""
-NARROW = 5
+NARROW = 6
 """Columns in the terminal."""
 MEANING = (
     'error: rms difference of the force to that of the reference; share: of its mean force in '
-    'contact; time: of one processor; ratio: to the time of the reference. No other setting than '
-    'those with a star has a smaller error for the same time or less.'
+    'contact; time: of one processor; ratio: to the time of the reference. A star marks a setting '
+    'that no other one beats: none has a smaller error in the same time or less.'
 )
 _COLOUR = '#1f4e8c'
 
@@ -40,7 +39,7 @@ class Tradeoff:
         time: processor time of a session, median over bags [s].
         ratio: that time over the reference's for the same bag, median over bags [-].
         bags: number of bags.
-        on_front: no other setting has a smaller error for the same time or less.
+        on_front: it has all bags of the reference, and no other such setting beats it.
     """
 
     setting: str
@@ -64,8 +63,8 @@ class Tradeoff:
             '' if np.isnan(self.share) else f'{self.share:.1%}',
             f'{self.time:.2f}',
             f'{self.ratio:.2f}',
-            ends,
             str(self.bags),
+            ends,
         )
 
 
@@ -81,7 +80,7 @@ def tradeoffs(rows: Sequence[Row], confidence: float) -> list[Tradeoff]:
     for row in rows:
         if row.setting.number and not row.result.failure:
             done.setdefault(row.setting.identity, {})[row.bag.hash] = row
-    best = done.get(rows[0].result.reference, {}) if rows else {}
+    best = {r.bag.hash: r for r in rows if r.is_reference and not r.result.failure}
     names = short_names(
         dict.fromkeys(
             key for of in done.values() for row in of.values() for key in row.setting.changes
@@ -112,36 +111,36 @@ def tradeoffs(rows: Sequence[Row], confidence: float) -> list[Tradeoff]:
                 on_front=False,
             )
         )
-    return with_front(found)
+    return _with_front(found, len(best))
 
 
-def with_front(found: Sequence[Tradeoff]) -> list[Tradeoff]:
-    """Return settings the cheapest first, with those on the front marked."""
+def _with_front(found: Sequence[Tradeoff], bags: int) -> list[Tradeoff]:
+    """Return settings the cheapest first, with those on the front marked; it has all bags."""
     least, marked = np.inf, []
     for one in sorted(found, key=lambda one: (one.ratio, one.error)):
-        marked.append(replace(one, on_front=one.error < least))
-        least = min(least, one.error)
+        whole = one.bags == bags
+        marked.append(replace(one, on_front=whole and one.error < least))
+        least = min(least, one.error) if whole else least
     return marked
 
 
 def tradeoff_figure(found: Sequence[Tradeoff]) -> Figure | None:
     """Return a plot of error over cost, with the numbers of the table; None: there is no error."""
-    shown = [(str(n), one) for n, one in enumerate(found, start=1) if one.share > 0.0]
+    shown = [(str(n), one) for n, one in enumerate(found, start=1) if one.error > 0.0]
     if not shown:
         return None
     figure = Figure(figsize=(8.0, 4.5), layout='constrained')
     axes: Any = figure.subplots()
-    front = np.array([(one.ratio, one.share) for _, one in shown if one.on_front])
+    front = np.array([(one.ratio, one.error) for _, one in shown if one.on_front])
     axes.step(*front.reshape(-1, 2).T, where='post', color=_COLOUR, lw=0.8)
     for number, one in shown:
-        at, fill = (one.ratio, one.share), 'full' if one.on_front else 'none'
+        at, fill = (one.ratio, one.error), 'full' if one.on_front else 'none'
         axes.plot(*at, 'o', ms=5, color=_COLOUR, fillstyle=fill)
         axes.annotate(number, at, xytext=(5, 4), textcoords='offset points', fontsize=9)
     axes.set(
         xlabel='processor time, as a share of the reference',
-        ylabel='error of the force, as a share of its mean in contact',
+        ylabel='error of the force, rms [N]',
         yscale='log',
     )
     axes.set_xlim(left=0.0)
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     return figure

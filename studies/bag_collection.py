@@ -64,17 +64,26 @@ def find_bags(patterns: Iterable[str], folder: Path) -> list[StudyBag]:
     return list(found.values())
 
 
-def path_of(place: str) -> Path:
-    """Return the path of a bag or a mesh; a bag at a URL is copied first.
+def folder_of(place: str) -> Path:
+    """Return the folder of a bag; one at a URL is copied first.
 
     Raises:
         UnavailableError: it is not there.
     """
     if is_url(place):
         return copied_bag(place)
-    if not Path(place).exists():
-        raise UnavailableError(f'{place} is not there on this worker: give all the same folders')
+    require(Path(place))
     return Path(place)
+
+
+def require(path: Path) -> None:
+    """Refuse a bag or a mesh that is not there.
+
+    Raises:
+        UnavailableError: it is not there.
+    """
+    if not path.exists():
+        raise UnavailableError(f'{path} is not there on this worker: give all the same folders')
 
 
 def _bags_at(url: str) -> Iterator[StudyBag]:

@@ -231,4 +231,14 @@ def _result(future: Any, job: Job) -> Result:
 
 def lost(job: Job, reason: str) -> Result:
     """Return the result of a row that no worker could compute."""
-    return Result({}, reason, 0, replace(job.identity, cpu=''), 0.0, 0.0, 0, lost=True)
+    return Result(
+        {},
+        reason,
+        0,
+        replace(job.identity, cpu=''),
+        0.0,
+        0.0,
+        0,
+        lost=True,
+        reference=job.reference.identity,
+    )

@@ -42,18 +42,18 @@ from cutting_trainer.recordings.what_if import (
 )
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import load_scene
-from cutting_trainer.studies.bag_collection import hash_of_bag, path_of
+from cutting_trainer.studies.bag_collection import folder_of, hash_of_bag, require
 from cutting_trainer.studies.designs import RECORDED, Setting
 from cutting_trainer.studies.identity import Identity, identity_of_worker
 from cutting_trainer.studies.outputs import outputs_of
-from cutting_trainer.studies.remote_bags import UnavailableError
+from cutting_trainer.studies.remote_bags import UnavailableError, without_copies
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
 
 Floats = NDArray[np.float64]
 
 
-_SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError, UnavailableError)
+_SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError)
 _PASSING = (UnavailableError, OSError, MemoryError)
 """Errors of a machine, which another start may not meet."""
 _MAX_REASON = 500
@@ -152,8 +152,10 @@ def evaluate(job: Job) -> Result:
     lost, series = False, None
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
-            reference = _reference_forces(job) if job.reference.number else None
+            reference, why_not = _reference_forces(job) if job.reference.number else (None, '')
             warm = time.thread_time()
+            if why_not:
+                raise SessionError(why_not)
             run, mesh, differs = _compute(job.bag, job.bag_hash, job.setting, Path(temporary))
             if reference is None:
                 reference = read_recording(job.bag, job.bag_hash).felt.forces
@@ -199,23 +201,30 @@ def warm_up() -> None:
     warm_up_force_path(ToolSettings(), device, HapticsSettings(), device.load_profile())
 
 
-def _reference_forces(job: Job) -> Floats:
-    """Return the norm of the force under the reference of a row [N], shape (n,)."""
-    return _forces_under(json.dumps(job.reference.changes), job.bag, job.bag_hash)
+def _reference_forces(job: Job) -> tuple[Floats | None, str]:
+    """Return the norm of the force under the reference of a row [N], shape (n,), or why there is
+    none.
+    """
+    reference = job.reference
+    return _forces_under(reference.identity, json.dumps(reference.changes), job.bag, job.bag_hash)
 
 
 @lru_cache(maxsize=_KEPT_BAGS)
-def _forces_under(changes: str, bag: str, bag_hash: str) -> Floats:
+def _forces_under(
+    identity: str, changes: str, bag: str, bag_hash: str
+) -> tuple[Floats | None, str]:
+    """Compute the forces of a setting. Its identity stands for the content of its mesh."""
     setting = Setting(1, json.loads(changes))
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
             run, _, _ = _compute(bag, bag_hash, setting, Path(temporary))
-        except _PASSING:
+        except UnavailableError as error:
+            raise UnavailableError(f'the reference: {error}') from None
+        except (OSError, MemoryError):
             raise
         except Exception as error:
-            said = _reason(error).replace(f'{temporary}/', '')
-            raise SessionError(f'the reference: {said}') from error
-    return run.forces
+            return None, f'the reference: {_reason(error)}'.replace(f'{temporary}/', '')
+    return run.forces, ''
 
 
 def _compute(
@@ -227,7 +236,7 @@ def _compute(
     recording = read_recording(place, bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
     if setting.mesh is not None:
-        path_of(str(setting.mesh))
+        require(setting.mesh)
     scene = load_scene(str(restore_scene(bag, temporary, setting.in_yaml)))
     changed, differs = setting.number > 0, None
     refuse_lost_changes(bag, setting.changes)
@@ -249,7 +258,7 @@ def read_recording(place: str, expected_hash: str) -> Recording:
         BagError: it is unreadable, or another one than that of the study.
         SessionError: the bag has no poses, or no forces of the hand.
     """
-    folder = path_of(place)
+    folder = folder_of(place)
     if hash_of_bag(folder) != expected_hash:
         raise BagError(f'{place} is not the bag that the study was started with: it has changed')
     bag = open_bag(folder)
@@ -260,7 +269,7 @@ def read_recording(place: str, expected_hash: str) -> Recording:
 
 def _reason(error: Exception) -> str:
     """Return a sentence about a failure, with its place where the sentence is not ours."""
-    text = ' '.join(str(error).split())
+    text = without_copies(' '.join(str(error).split()))
     if isinstance(error, _SENTENCES):
         return text
     place = traceback.extract_tb(error.__traceback__)[-1]

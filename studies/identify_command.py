@@ -53,7 +53,7 @@ class IdentifyOptions:
     """Options of the command.
 
     Attributes:
-        bags: bags, folders with bags anywhere below, or globs.
+        bags: bags, folders with bags anywhere below, globs, or URLs of these.
         output: folder of the results.
         parameters: names of the constants; (): those that the scene has and hands may touch.
         noise: of the force for one sample of one component [N].

@@ -39,6 +39,8 @@ OUTPUTS = {
     'frames_taken_back': Output('', 'frames that diverged and were taken back'),
 }
 """All outputs by column."""
+COMPARED = ('force_rms_difference', 'largest_force_difference')
+"""Those that compare with the reference."""
 
 
 def outputs_of(run: Run, reference: NDArray[np.float64], mesh: TetMesh) -> dict[str, float]:

@@ -32,7 +32,7 @@ from cutting_trainer.studies.effects import (
     effects_of_keys,
     effects_of_settings,
 )
-from cutting_trainer.studies.outputs import OUTPUTS
+from cutting_trainer.studies.outputs import COMPARED, OUTPUTS
 from cutting_trainer.studies.table import Row
 
 PAGE_FILE = 'summary.html'
@@ -74,9 +74,11 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
         study: its outputs and level of confidence.
         planned: number of rows of the whole study.
     """
-    every = effects_of_settings(rows, study.outputs, study.confidence)
-    designed = [row for row in rows if not row.is_reference]
-    keys, why_not = effects_of_keys(designed, study.outputs, study.confidence)
+    outputs = study.outputs
+    if study.reference is not None:  # an error, whose effect would be the difference of two
+        outputs = [name for name in outputs if name not in COMPARED]
+    every = effects_of_settings(rows, outputs, study.confidence)
+    keys, why_not = effects_of_keys(_designed(rows), outputs, study.confidence)
     settings = [effect for effect in every if not effect.is_zero]
     changed = {effect.output for effect in settings}
     failures = Counter(row.result.failure for row in rows if row.result.failure)
@@ -103,13 +105,19 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
             f'says where): {", ".join(differing)}'
         )
     return StudySummary(
-        settings=_by_output(settings, study.outputs),
-        keys=_by_output([effect for effect in keys if effect.output in changed], study.outputs),
+        settings=_by_output(settings, outputs),
+        keys=_by_output([effect for effect in keys if effect.output in changed], outputs),
         tradeoffs=tradeoffs(rows, study.confidence),
-        unchanged=[name for name in study.outputs if name not in changed and every],
+        unchanged=[name for name in outputs if name not in changed and every],
         failures=dict(failures.most_common()),
         notes=notes,
     )
+
+
+def _designed(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows without a reference that changes other keys than the designs do."""
+    keys = {key for row in rows if not row.is_reference for key in row.setting.changes}
+    return [row for row in rows if not row.is_reference or row.setting.changes.keys() == keys]
 
 
 def _by_output(effects: Iterable[Effect], outputs: list[str]) -> list[Effect]:
@@ -122,10 +130,14 @@ def as_text(summary: StudySummary) -> Group:
     if summary.tradeoffs:
         beside = Table(box=box.SIMPLE_HEAD)
         for number, name in enumerate(HEAD[:NARROW]):
-            beside.add_column(name, justify='right' if number else 'left', overflow='fold')
+            beside.add_column(
+                escape_markup(name), justify='right' if number else 'left', overflow='fold'
+            )
         for one in summary.tradeoffs[:MAX_LINES]:
             beside.add_row(*map(escape_markup, one.cells[:NARROW]))
         parts += [beside, MEANING]
+        if len(summary.tradeoffs) > MAX_LINES:
+            parts.append('the page has all settings')
     few = len({effect.cause for effect in summary.settings}) <= _MAX_CAUSES
     effects = summary.settings if few or not summary.keys else summary.keys
     shown = Table(box=box.SIMPLE_HEAD)
@@ -160,8 +172,10 @@ def write_page(file: Path, title: str, summary: StudySummary) -> None:
         if figure is not None:
             caption = 'Change of each output, and its confidence interval over bags.'
             parts.append(image(figure, caption))
-        if (figure := tradeoff_figure(summary.tradeoffs)) is not None:
-            parts += ['<h2>Accuracy and cost</h2>', image(figure, MEANING)]
+        if summary.tradeoffs:
+            parts.append('<h2>Accuracy and cost</h2>')
+            if (figure := tradeoff_figure(summary.tradeoffs)) is not None:
+                parts.append(image(figure, MEANING))
             numbered = enumerate(summary.tradeoffs, start=1)
             parts.append(table([(str(n), *one.cells) for n, one in numbered], ('', *HEAD)))
     for heading, effects in _sections(summary):

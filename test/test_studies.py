@@ -6,6 +6,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -20,6 +21,7 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.studies import evaluation
 from cutting_trainer.studies.accuracy_and_cost import tradeoff_figure, tradeoffs
 from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find_bags, hash_of_bag
+from cutting_trainer.studies.cluster import lost
 from cutting_trainer.studies.description import Study, read_study
 from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings, interval
@@ -188,6 +190,24 @@ def test_keys_that_share_their_last_word_are_told_apart() -> None:
     )
 
 
+def test_a_reference_counts_for_its_keys_where_the_designs_have_them(tmp_path: Path) -> None:
+    values = [(3, {'a.b': 3}), (1, {'a.b': 1}), (2, {'a.b': 2})]
+    text = GOOD.replace('outputs: [', 'reference: {}\noutputs: [force_rms_difference, ')
+    asked = study(tmp_path, text)
+    for of_reference, cause, mean in (({}, 'b 1 -> 3', 4.0), ({'a.c': 0}, 'b 1 -> 2', 3.0)):
+        settings = [Setting(n, changes | (of_reference if n == 3 else {})) for n, changes in values]
+        rows = [
+            replace(row, result=replace(row.result, reference=settings[0].identity))
+            for row in made_rows(2, settings, np.array([[0, 9, 5, 8]] * 2))
+        ]
+        (found,) = summarise(rows, asked, len(rows)).keys
+        assert (found.output, found.cause, found.mean) == (
+            'largest_force',
+            cause,
+            pytest.approx(mean),
+        )
+
+
 def test_one_key_has_an_effect_of_its_own() -> None:
     settings = [Setting(1, {'a.b': 1}), Setting(2, {'a.b': 2})]
     rows = made_rows(2, settings, np.array([[0, 5, 8]] * 2))
@@ -234,6 +254,25 @@ def test_a_row_is_compared_with_the_force_under_the_reference(monkeypatch) -> No
     never = Setting(1, {'tissue.material.youngs_modulus': -1})
     failed = evaluation.evaluate(replace(asked, reference=never))
     assert failed.failure.startswith('the reference: ') and 'youngs_modulus' in failed.failure
+    monkeypatch.setattr(evaluation, '_compute', lambda *_: [][1])
+    again = evaluation.evaluate(replace(asked, reference=never))
+    assert again.failure == failed.failure and not again.lost  # it is not computed again
+
+
+def test_a_reference_whose_mesh_has_changed_is_computed_anew(monkeypatch, tmp_path: Path) -> None:
+    forces = iter((1.0, 2.0))
+    monkeypatch.setattr(
+        evaluation,
+        '_compute',
+        lambda *_: (SimpleNamespace(forces=np.full(3, next(forces))), None, 0),
+    )
+    mesh = tmp_path / 'fine.vtk'
+    for text, force in (('coarse', 1.0), ('fine', 2.0), ('fine', 2.0)):
+        mesh.write_text(text)
+        job = Job('bag', 'hash', RECORDED, identity_of_worker(),
+                  reference=Setting(1, {'tissue.mesh': str(mesh)}))  # fmt: skip
+        found, why_not = evaluation._reference_forces(job)
+        assert not why_not and found is not None and found[0] == force
 
 
 def test_hypercube_has_one_sample_in_each_part_of_a_range_and_sobol_too(tmp_path: Path) -> None:
@@ -273,11 +312,13 @@ def test_bags_at_a_url_are_copied_once_and_anew_when_they_change(
     there = tmp_path / 'there'
     for name in ('palpation', 'straight_cut'):
         shutil.copytree(SAMPLES / name, there / 'day 1' / name)
+    shutil.copytree(SAMPLES / 'palpation', there / 'day 1' / 'straight_cut' / 'inner')
     (there / 'day 1' / 'palpation' / 'report.html').write_text('what is beside a bag is not of it')
     url = f'file://{there}'
-    found = find_bags([f'{url}/', f'{url}/*/pal*'], tmp_path)
+    (there / 'day 1').rename(there / 'day [1]')
+    found = find_bags([f'{url}/', f'{url}/*/pal*', f'{url}/day [1]'], tmp_path)
     assert [bag.name for bag in found] == [
-        f'{url}/day 1/palpation', f'{url}/day 1/straight_cut'
+        f'{url}/day [1]/palpation', f'{url}/day [1]/straight_cut'
     ]  # fmt: skip
     assert [bag.hash for bag in found] == [hash_of_bag(SAMPLES / n.path.name) for n in found]
     kept = [(bag.path, bag.path.stat().st_mtime_ns) for bag in found]
@@ -287,10 +328,11 @@ def test_bags_at_a_url_are_copied_once_and_anew_when_they_change(
     assert [(bag.path, bag.path.stat().st_mtime_ns) for bag in again] == kept
     first = read_recording(found[0].place, found[0].hash)
     assert first.bag.path.parent == found[0].path and first.felt.forces.max() > 0.0
-    with (there / 'day 1' / 'palpation' / 'metadata.yaml').open('a') as file:
+    with (there / 'day [1]' / 'palpation' / 'metadata.yaml').open('a') as file:
         file.write('# changed\n')
+    (found[1].path / 'metadata.yaml').unlink()  # somebody tidies up
     changed, same = find_bags([url], tmp_path)
-    assert changed.hash == hash_of_bag(there / 'day 1' / 'palpation') != found[0].hash
+    assert changed.hash == hash_of_bag(there / 'day [1]' / 'palpation') != found[0].hash
     assert changed.path != found[0].path and same == found[1]
     evaluation.read_recording.cache_clear()
     with pytest.raises(BagError, match='has changed'):
@@ -303,6 +345,9 @@ def test_bags_at_a_url_are_copied_once_and_anew_when_they_change(
         ('file://{}/none', r'/none: there is no bag'),
         ('file://{}', r'there is no bag, no folder with metadata\.yaml'),
         ('file://{}/*.x', r'there is no bag'),
+        ('file://bags', r'give the whole path of a folder'),
+        ('file:///', r'give the whole path of a folder'),
+        ('ssh://me:secret@trainer.lan/bags', r'leave the password out'),
         ('nope://a/b', r'nope://a/b cannot be reached: Protocol not known: nope'),
     ],
 )
@@ -447,15 +492,18 @@ def test_settings_on_the_front_have_no_rival_that_is_nearer_for_the_same_time(
     rows[-1] = replace(rows[-1], result=replace(rows[-1].result, failure='it diverged'))
     found = tradeoffs(rows, 0.95)
     assert [one.setting for one in found] == ['x=6', 'x=2', 'x=4', 'x=3', 'x=5', 'x=1']
-    assert [one.on_front for one in found] == [True, False, True, False, False, True]
+    assert [one.on_front for one in found] == [False, True, True, False, False, True]
     assert [one.ratio for one in found] == [0.125, 0.125, 0.25, 0.25, 0.5, 1.0]
     assert (found[1].error, found[1].time, found[1].bags) == (pytest.approx(0.4), 2.0, 3)
     assert found[1].share == pytest.approx(0.4 * (1 / 2 + 1 / 4 + 1 / 6) / 3)
-    assert (found[0].bags, found[0].time) == (2, 1.5)  # a failed row counts with no bag
+    assert (found[0].bags, found[0].time) == (2, 1.5)  # it failed for one bag, and has no star
     summary = summarise(rows, study(tmp_path, GOOD), len(rows))
     write_page(tmp_path / 'page.html', 'models', summary)
     text = (tmp_path / 'page.html').read_text()
     assert 'Accuracy and cost' in text and 'x=4 *' in text and 'x=3 *' not in text
+    gone = lost(Job('', '', RECORDED, identity_of_worker(), reference=settings[0]), 'it died')
+    assert tradeoffs([Row(bag, RECORDED, gone), *rows], 0.95) == found
+    assert gone.reference == settings[0].identity
     assert not tradeoffs([replace(r, result=replace(r.result, reference='')) for r in rows], 0.95)
     only_the_best = [row for row in rows if row.setting.number in (1, 2)]
     slow = [replace(r, result=replace(r.result, cpu=9.0 - r.setting.number)) for r in only_the_best]
