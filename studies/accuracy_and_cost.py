@@ -21,8 +21,9 @@ NARROW = 6
 """Columns in the terminal."""
 MEANING = (
     'error: rms difference of the force to that of the reference; share: of its mean force in '
-    'contact; time: of one processor; ratio: to the time of the reference. A star marks a setting '
-    'that no other one beats: none has a smaller error in the same time or less.'
+    'contact; time: of one processor; ratio: to the time of the reference; both are medians over '
+    'bags. A star marks a setting that no other one beats: none has a smaller error at the same '
+    'ratio or less.'
 )
 _COLOUR = '#1f4e8c'
 
@@ -39,6 +40,7 @@ class Tradeoff:
         time: processor time of a session, median over bags [s].
         ratio: that time over the reference's for the same bag, median over bags [-].
         bags: number of bags.
+        is_reference: it is that with which the others are compared.
         on_front: it has all bags of the reference, and no other such setting beats it.
     """
 
@@ -50,15 +52,16 @@ class Tradeoff:
     time: float
     ratio: float
     bags: int
+    is_reference: bool
     on_front: bool
 
     @property
     def cells(self) -> tuple[str, ...]:
         """Return the columns of `HEAD`."""
         ends = '' if np.isnan(self.low) else f'{self.low:.2g} to {self.high:.2g}'
-        name = f'{self.setting} *' if self.on_front else self.setting
+        mark = ' (reference)' if self.is_reference else ' *' if self.on_front else ''
         return (
-            name,
+            f'{self.setting}{mark}',
             f'{self.error:.3g}',
             '' if np.isnan(self.share) else f'{self.share:.1%}',
             f'{self.time:.2f}',
@@ -108,6 +111,7 @@ def tradeoffs(rows: Sequence[Row], confidence: float) -> list[Tradeoff]:
                 time=float(np.median(times[:, 0])),
                 ratio=float(np.median(times[:, 0] / times[:, 1])),
                 bags=len(pairs),
+                is_reference=pairs[0][0].is_reference,
                 on_front=False,
             )
         )
@@ -142,5 +146,6 @@ def tradeoff_figure(found: Sequence[Tradeoff]) -> Figure | None:
         ylabel='error of the force, rms [N]',
         yscale='log',
     )
+    axes.margins(x=0.1)
     axes.set_xlim(left=0.0)
     return figure

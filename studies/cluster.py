@@ -31,6 +31,8 @@ _LOST_TIMEOUT_S = 60.0
 """Time for a killed worker to be back, after which it is replaced."""
 _RESTORING_PERIOD_MS = 2000.0
 _POLL_S = 0.05
+_LEAVE_CTRL_C = 'import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)'
+"""A terminal interrupts all processes of a command, and this one ends its workers in order."""
 _MIN_WAITING = 16
 _PER_THREAD = 2
 """Rows that wait at the scheduler for each thread of the workers; the rest waits here."""
@@ -50,6 +52,7 @@ def own_cluster(workers: int) -> Iterator[Client]:
             'distributed.scheduler.worker-saturation': 1.0,
             # A paused worker would wait for ever: its memory does not fall.
             'distributed.worker.memory.pause': False,
+            'distributed.worker.preload': [_LEAVE_CTRL_C],
             'distributed.deploy.lost-worker-timeout': f'{_LOST_TIMEOUT_S:.0f} s',
         }
     ):

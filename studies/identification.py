@@ -76,6 +76,11 @@ class Prior:
     spread: float
     source: str
 
+    @property
+    def text(self) -> str:
+        """Return the range that has 95 % of the prior, in a few words."""
+        return f'{self.median:.3g}, within a factor of {np.exp(1.96 * self.spread):.2g}'
+
 
 def prior_of(name: str, recorded: float) -> Prior:
     """Return the prior of a constant from the presets, or around its recorded value.

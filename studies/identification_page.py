@@ -41,7 +41,7 @@ def write_identification_page(
             f'{name} [{PARAMETERS[name]}]',
             f'{e.value:.4g}',
             f'{e.low:.4g} to {e.high:.4g}',
-            f'{e.prior.median:.3g}',
+            e.prior.text,
             e.prior.source,
         )
         for name, e in estimates.items()

@@ -182,8 +182,8 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
     ]
     if tissue.model in LOCKING:
         notes.append(
-            f'the force of the model {tissue.model} depends on the mesh: '
-            '--with tissue.model=stiffening does not'
+            f'the force of the model {tissue.model} depends on the mesh, and that of stiffening '
+            'does not (--with tissue.model=stiffening)'
         )
     if options.refine:
         coarse = problem.estimates
@@ -200,7 +200,12 @@ def identify(bags: Sequence[StudyBag], options: IdentifyOptions, client: Any) ->
     running.check(forces)
     return Identification(
         estimates=estimates_of(problem, priors),
-        sentences=[*identifiability(problem), *notes, *running.failures()],
+        sentences=[
+            *identifiability(problem),
+            *notes,
+            *running.failures(),
+            f'{running.computed} sessions were computed, of {len(bags)} recorded',
+        ],
         computed=running.computed,
         cpu=running.cpu,
         problem=problem,
@@ -320,6 +325,6 @@ def _table(estimates: Mapping[str, Estimate]) -> Table:
     for name, e in estimates.items():
         interval = f'{e.low:.4g} to {e.high:.4g}'
         unit = PARAMETERS[name]
-        prior = f'{e.prior.median:.3g} ({e.prior.source})'
+        prior = f'{e.prior.text} ({e.prior.source})'
         table.add_row(f'{name} ({unit})', f'{e.value:.4g}', interval, prior)
     return table

@@ -51,7 +51,7 @@ class StudySummary:
     """Effects of a study, and the sentences beside them.
 
     Attributes:
-        settings, keys: effects that are not zero in all bags.
+        settings, keys: effects on the outputs that a setting changes in some bag.
         tradeoffs: error and cost of each setting, where the study has a reference.
         unchanged: outputs that no setting changes in any bag.
         failures: number of rows by reason.
@@ -79,18 +79,18 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
         outputs = [name for name in outputs if name not in COMPARED]
     every = effects_of_settings(rows, outputs, study.confidence)
     keys, why_not = effects_of_keys(_designed(rows), outputs, study.confidence)
-    settings = [effect for effect in every if not effect.is_zero]
-    changed = {effect.output for effect in settings}
+    changed = {effect.output for effect in every if not effect.is_zero}
+    settings = [effect for effect in every if effect.output in changed]
     failures = Counter(row.result.failure for row in rows if row.result.failure)
     notes = [
-        f'{len(rows)} of {planned} rows are done; a row for each bag as recorded is among them',
+        f'{len(rows)} of {planned} rows are done; each bag has one of its session as recorded',
         f'intervals: {study.confidence:.1%} by bootstrap over bags; effects are differences to the '
         'sessions as recorded',
     ]
     counts = {effect.bags for effect in every}
     if counts and min(counts) < MIN_BAGS:
         notes.append(
-            f'some effects are of {min(counts)} bags: with fewer than {MIN_BAGS} the intervals are '
+            f'some effects are of fewer than {MIN_BAGS} bags ({min(counts)}): their intervals are '
             'too narrow'
         )
     if why_not:
@@ -125,7 +125,7 @@ def _by_output(effects: Iterable[Effect], outputs: list[str]) -> list[Effect]:
 
 
 def as_text(summary: StudySummary) -> Group:
-    """Return a summary for the terminal: effects of settings, or of keys if there are many."""
+    """Return a summary for the terminal: effects of keys, or of settings where keys have none."""
     parts: list[Any] = []
     if summary.tradeoffs:
         beside = Table(box=box.SIMPLE_HEAD)
@@ -138,8 +138,7 @@ def as_text(summary: StudySummary) -> Group:
         parts += [beside, MEANING]
         if len(summary.tradeoffs) > MAX_LINES:
             parts.append('the page has all settings')
-    few = len({effect.cause for effect in summary.settings}) <= _MAX_CAUSES
-    effects = summary.settings if few or not summary.keys else summary.keys
+    effects = summary.keys or summary.settings
     shown = Table(box=box.SIMPLE_HEAD)
     for number, name in enumerate(_HEAD[1:]):
         shown.add_column(name, justify='right' if number else 'left', overflow='fold')

@@ -128,7 +128,7 @@ def test_every_library_that_a_room_imports_is_pinned_for_run_time(room: str) -> 
     # and Dask, the encoders of films and HDF5 are installed before their first use
     extra = {
         'mesh_import': {'pytetwild'},
-        'studies': {'av', 'dask', 'distributed', 'h5py', 'pillow', 'tornado'},
+        'studies': {'av', 'dask', 'distributed', 'fsspec', 'h5py', 'pillow', 'tornado'},
         'recordings': {'av', 'pillow'},
     }.get(room, set())
     assert imported_by(room) <= pins('requirements.txt').keys() | extra

@@ -202,6 +202,27 @@ def test_killed_study_goes_on_and_has_each_row_once(folder: Path, one_worker: Pa
     assert (output / TABLE_FILE).read_bytes() == (one_worker / TABLE_FILE).read_bytes()
 
 
+def test_ctrl_c_ends_a_study_in_order_with_one_sentence(folder: Path) -> None:
+    output = folder / 'interrupted'
+    command = [sys.executable, '-m', 'cutting_trainer.cli', 'study', str(folder / 'study.yaml')]
+    running = subprocess.Popen(
+        [*command, '-o', str(output), '--workers', '2'],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        wait_for(1, output)
+        os.killpg(running.pid, signal.SIGINT)  # as a terminal does
+        _, said = running.communicate(timeout=_TIMEOUT_S)
+    finally:
+        running.kill()
+    assert running.returncode == Status.INTERRUPTED and 'goes on with what is left' in said
+    assert 'Traceback' not in said
+    assert 0 < lines(output) < ROWS
+
+
 def test_study_goes_on_after_the_last_whole_row_of_its_journal(
     folder: Path, one_worker: Path
 ) -> None:
