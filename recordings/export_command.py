@@ -8,6 +8,7 @@ from typing import Any
 import meshio
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from pyarrow import parquet as pq
 
 from cutting_trainer.bags.playback_messages import first_time
@@ -83,13 +84,32 @@ def write_mesh(tissue: MeshReplica, file: Path) -> None:
     surface (.ply, .stl) has the triangles of the outside and of cuts.
     """
     if file.suffix in SOLIDS:
-        cells = [('tetra', np.asarray(tissue.tetrahedra, np.int64))]
-        data = {'displacement': tissue.displacement, 'fixed': tissue.fixed.astype(np.int32)}
-        meshio.Mesh(tissue.positions(), cells, point_data=data).write(file)
+        write_solid(file, tissue.rest, tissue.displacement, tissue.tetrahedra, tissue.fixed)
         return
     used, triangles = np.unique(tissue.triangles, return_inverse=True)
     cells = [('triangle', triangles.reshape(-1, 3).astype(np.int32))]
     meshio.Mesh(tissue.positions()[used], cells).write(file)
+
+
+def write_solid(
+    file: Path,
+    rest: NDArray[np.float64],
+    displacement: NDArray[np.float64],
+    tetrahedra: NDArray[np.integer],
+    fixed: NDArray[np.integer],
+) -> None:
+    """Write a deformed solid with its displacement and fixed flag by node.
+
+    Args:
+        file: with one of the extensions `SOLIDS`.
+        rest: [m], shape (n, 3).
+        displacement: [m], shape (n, 3).
+        tetrahedra: shape (m, 4).
+        fixed: not 0 where the node does not move, shape (n,).
+    """
+    cells = [('tetra', np.asarray(tetrahedra, np.int64))]
+    data = {'displacement': displacement, 'fixed': fixed.astype(np.int32)}
+    meshio.Mesh(rest + displacement, cells, point_data=data).write(file)
 
 
 def write_streams(bag: Bag, folder: Path, *, parquet: bool) -> list[Path]:

@@ -23,6 +23,8 @@ from cutting_trainer.bags.recorded_indexings import recorded_indexings
 from cutting_trainer.bags.resimulation import Resimulation, answer_frames, as_recorded
 from cutting_trainer.bags.resimulation_start import find_beginning
 from cutting_trainer.bags.topic_names import CONTACT, POSE, SERVO_CF, of_session
+from cutting_trainer.exercises.bag_feed import MOTION_FIELDS
+from cutting_trainer.exercises.metrics import Attempt
 from cutting_trainer.haptic_bridge.force_kernels import NONE
 from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.indexing import Indexing
@@ -139,6 +141,7 @@ class Hand:
         ticks: time [ns], norm of the force [N], contact flag and force [N] of each tick.
         indexings: recorded changes of how the hand moves the tool, that are to come.
         indexing: the last one; None before the first.
+        motion: rows of `Attempt.add_motion`, with the stamp of the pose [ns] for the time.
     """
 
     path: ForcePath
@@ -150,6 +153,7 @@ class Hand:
     ticks: list[tuple[int, float, bool, tuple[float, ...]]] = field(default_factory=list)
     indexings: deque[Indexing] = field(default_factory=deque)
     indexing: Indexing | None = None
+    motion: list[tuple[float, ...]] = field(default_factory=list)
 
     def index(self, until: int) -> None:
         """Clutch, and change the scale of the motion, as before a device pose, by its stamp [ns].
@@ -185,6 +189,9 @@ class Hand:
         if self.state is CrtkState.DISABLED and self.path.is_fresh(now):
             self.state = CrtkState.ENABLED
         self.contact = StampedMessage(tick.contact_stamp_ns, '', tick.contact)
+        if tick.contact_stamp_ns:  # 0: there was no device yet
+            row = (x for place in MOTION_FIELDS for x in tick.contact[place])
+            self.motion.append((tick.contact_stamp_ns, *row))
         force = tick.wrench[WrenchStampedCodec.fields['force']]
         self.ticks.append((now, self.path.force_norm, self.path.contact != NONE, force))
 
@@ -226,8 +233,14 @@ def move_hand(
     indexings: Sequence[Indexing],
     scene: Scene,
     computed: Resimulation,
+    attempt: Attempt | None = None,
 ) -> Run:
     """Compute a session from frames, poses and indexings already read, as `run_experiment` does.
+
+    Args:
+        records, poses, indexings: as read.
+        scene, computed: as of `run_experiment`.
+        attempt: attempt at an exercise that is to see the session; None: there is none.
 
     Raises:
         SessionError: the changed session ends in a FAULT.
@@ -235,10 +248,21 @@ def move_hand(
     hand = Hand(make_force_path(scene), indexings=deque(indexings))
     untils = (hand.follow(record) for record in records)
     computed.answer_frames = answer_frames(records)
+    topology = -1
     for _ in closed_loop(poses, untils, hand, computed):
-        pass
+        mesh = computed.simulation.mesh
+        if attempt is not None and mesh.topology != topology:
+            topology = mesh.topology
+            now = hand.ticks[-1][0] if hand.ticks else poses[0].stamp_ns
+            attempt.see_tissue((now - poses[0].stamp_ns) * _NANOSECOND_S, mesh)
     times, forces, contact, vectors = map(np.array, zip(*hand.ticks, strict=True))
-    return _run(RecordedForce(times, forces, contact, vectors), computed)
+    run = _run(RecordedForce(times, forces, contact, vectors), computed)
+    if attempt is not None:
+        motion = np.array(hand.motion)
+        motion[:, 0] = (motion[:, 0] - times[0]) * _NANOSECOND_S
+        attempt.add_motion(motion)
+        attempt.add_forces(np.column_stack([run.times, run.forces]))
+    return run
 
 
 def recorded_run(bag: Bag, computed: Resimulation) -> tuple[Run, int | None]:

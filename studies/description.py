@@ -25,7 +25,7 @@ from cutting_trainer.node_common.scene_reader import (
     SceneModel,
     read_document,
 )
-from cutting_trainer.studies.outputs import OUTPUTS
+from cutting_trainer.studies.outputs import FIGURES, OUTPUTS, FileName
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 
 MAX_SETTINGS = 100_000
@@ -190,7 +190,10 @@ class Study(SceneModel):
         'absent: the recorded force',
     )
     outputs: list[OutputName] = Field(
-        default=list(OUTPUTS), min_length=1, description='columns of the table'
+        default=list(FIGURES), min_length=1, description='columns of the table'
+    )
+    keep: list[FileName] = Field(
+        default=[], description='files kept of each session: force over time, tissue at the end'
     )
     confidence: float = Field(
         default=0.95, ge=0.5, le=0.999, description='level of the intervals, 0.5 to 0.999'

@@ -71,9 +71,12 @@ def effects_of_settings(
     settings = _settings(rows)
     names = short_names(_keys(settings))
     for setting in settings:
-        bags = [bag for bag in values[setting.identity] if bag in recorded]
-        for output in outputs if bags else ():
-            now = np.array([values[setting.identity][bag][output] for bag in bags])
+        here = values[setting.identity]
+        for output in outputs:
+            bags = [b for b in here if output in here[b] and output in recorded.get(b, ())]
+            if not bags:
+                continue
+            now = np.array([here[bag][output] for bag in bags])
             then = np.array([recorded[bag][output] for bag in bags])
             mean, low, high = interval(now - then, confidence)
             reference = float(then.mean())
@@ -104,24 +107,22 @@ def effects_of_keys(
         return [], ''
     design = np.column_stack([np.ones(len(settings)), *columns.values()])
     values = _by_setting(rows)
-    found = dict[str, list[Floats]]()
-    for bag in values.get(RECORDED.identity, {}):
-        there = [i for i, s in enumerate(settings) if bag in values[s.identity]]
-        if np.linalg.matrix_rank(design[there]) < design.shape[1]:
-            continue
-        table = np.array(
-            [[values[settings[i].identity][bag][name] for name in outputs] for i in there]
-        )
-        slopes = np.linalg.lstsq(design[there], table, rcond=None)[0][1:]
-        slopes[np.abs(slopes) < _ROUNDING * np.abs(table).max(axis=0)] = 0.0
-        for name, slope in zip(columns, slopes, strict=True):
-            found.setdefault(name, []).append(slope)
+    found: dict[tuple[str, str], list[float]] = {}
+    for output in outputs:
+        for bag in values.get(RECORDED.identity, {}):
+            there = [i for i, s in enumerate(settings) if output in values[s.identity].get(bag, ())]
+            if np.linalg.matrix_rank(design[there]) < design.shape[1]:
+                continue
+            given = np.array([values[settings[i].identity][bag][output] for i in there])
+            slopes = np.linalg.lstsq(design[there], given, rcond=None)[0][1:]
+            slopes[np.abs(slopes) < _ROUNDING * np.abs(given).max()] = 0.0
+            for name, slope in zip(columns, slopes, strict=True):
+                found.setdefault((name, output), []).append(float(slope))
     if not found:
         return [], 'the settings cannot tell the effects of their keys apart: add settings'
     return [
-        Effect(output, name, *interval(by_bag[:, i], confidence), len(by_bag), float('nan'))
-        for name, by_bag in ((name, np.array(slopes)) for name, slopes in found.items())
-        for i, output in enumerate(outputs)
+        Effect(output, name, *interval(np.array(slopes), confidence), len(slopes), float('nan'))
+        for (name, output), slopes in found.items()
     ], ''
 
 

@@ -4,7 +4,7 @@ import json
 import tempfile
 import time
 import traceback
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import get_args
@@ -19,6 +19,8 @@ from cutting_trainer.bags.recorded_indexings import recorded_indexings
 from cutting_trainer.bags.resimulation_start import ComputationStart, find_beginning
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
+from cutting_trainer.exercises.bag_feed import read_attempt
+from cutting_trainer.exercises.metrics import Attempt
 from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.scene_schema import (
     DeviceSettings,
@@ -45,9 +47,9 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.studies.bag_collection import folder_of, hash_of_bag, require
 from cutting_trainer.studies.designs import RECORDED, Setting
 from cutting_trainer.studies.identity import Identity, identity_of_worker
-from cutting_trainer.studies.outputs import outputs_of
+from cutting_trainer.studies.outputs import FileName, files_of, measures_of, outputs_of
 from cutting_trainer.studies.remote_bags import UnavailableError, without_copies
-from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
 
 Floats = NDArray[np.float64]
@@ -73,6 +75,7 @@ class Job:
         identity: code of whoever asks; a worker with other code refuses.
         series: the force over time is wanted, too.
         reference: setting whose force this one is compared with.
+        keep: names of the files that are wanted, too.
     """
 
     bag: str
@@ -81,6 +84,7 @@ class Job:
     identity: Identity
     series: bool = False
     reference: Setting = RECORDED
+    keep: tuple[FileName, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,7 @@ class Result:
         lost: no worker has computed it, for a reason that is not that of bag or setting.
         series: force on the hand at each pose [N], shape (n, 3), where the job asks for it.
         reference: identity of the setting that it is compared with.
+        files: content of the files that the job asks for, by name.
     """
 
     outputs: dict[str, float]
@@ -111,6 +116,7 @@ class Result:
     lost: bool = False
     series: Floats | None = None
     reference: str = ''
+    files: dict[str, bytes] = field(default_factory=dict)
 
 
 class OtherCodeError(RuntimeError):
@@ -149,18 +155,22 @@ def evaluate(job: Job) -> Result:
     began = time.thread_time()
     warm_up()
     warm, differs, failure, outputs = time.thread_time(), 0, '', dict[str, float]()
-    lost, series = False, None
+    lost, series, files = False, None, dict[str, bytes]()
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
             reference, why_not = _reference_forces(job) if job.reference.number else (None, '')
             warm = time.thread_time()
             if why_not:
                 raise SessionError(why_not)
-            run, mesh, differs = _compute(job.bag, job.bag_hash, job.setting, Path(temporary))
+            done = _compute(job.bag, job.bag_hash, job.setting, Path(temporary))
+            run, simulation, differs = done.run, done.simulation, done.differs
             if reference is None:
                 reference = read_recording(job.bag, job.bag_hash).felt.forces
-            outputs = outputs_of(run, reference, mesh)
+            outputs = outputs_of(run, reference, simulation.mesh)
+            if done.attempt is not None:
+                outputs |= measures_of(done.attempt)
             series = run.vectors if job.series else None
+            files = files_of(run, simulation, job.keep, Path(temporary))
         except Exception as error:  # a row with its reason: the study goes on
             failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
             lost = isinstance(error, _PASSING)
@@ -175,6 +185,7 @@ def evaluate(job: Job) -> Result:
         lost=lost,
         series=series,
         reference=job.reference.identity,
+        files=files,
     )
 
 
@@ -217,36 +228,51 @@ def _forces_under(
     setting = Setting(1, json.loads(changes))
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
-            run, _, _ = _compute(bag, bag_hash, setting, Path(temporary))
+            forces = _compute(bag, bag_hash, setting, Path(temporary)).run.forces
         except UnavailableError as error:
             raise UnavailableError(f'the reference: {error}') from None
         except (OSError, MemoryError):
             raise
         except Exception as error:
             return None, f'the reference: {_reason(error)}'.replace(f'{temporary}/', '')
-    return run.forces, ''
+    return forces, ''
 
 
-def _compute(
-    place: str, bag_hash: str, setting: Setting, temporary: Path
-) -> tuple[Run, TetMesh, int]:
-    """Return a session under a setting, its tissue at the end, and of a session as recorded the
-    first frame that differs from the recording; 0: there is none.
+@dataclass(frozen=True)
+class _Session:
+    """Session under a setting.
+
+    Attributes:
+        simulation: tissue at the end.
+        attempt: at the exercise of its scene; None: it has none.
+        differs: of a session as recorded, the first frame that differs; 0: there is none.
     """
+
+    run: Run
+    simulation: TissueSimulation
+    attempt: Attempt | None
+    differs: int
+
+
+def _compute(place: str, bag_hash: str, setting: Setting, temporary: Path) -> _Session:
+    """Compute a session under a setting."""
     recording = read_recording(place, bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
     if setting.mesh is not None:
         require(setting.mesh)
     scene = load_scene(str(restore_scene(bag, temporary, setting.in_yaml)))
     changed, differs = setting.number > 0, None
+    attempt = Attempt(scene.exercise) if scene.exercise.title else None
     refuse_lost_changes(bag, setting.changes)
     computed = recomputation(scene, beginning, changed=changed)
     if changed:
-        run = move_hand(recording.records, recording.poses, recording.indexings, scene, computed)
+        recorded = recording.records, recording.poses, recording.indexings
+        run = move_hand(*recorded, scene, computed, attempt)
     else:
         differs = recompute(recording.records, computed)
         run = as_felt(felt, computed)
-    return run, computed.simulation.mesh, differs or 0
+        attempt = attempt and read_attempt(bag, scene.exercise)
+    return _Session(run, computed.simulation, attempt, differs or 0)
 
 
 @lru_cache(maxsize=_KEPT_BAGS)

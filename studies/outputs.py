@@ -1,14 +1,24 @@
-"""Outputs of a study: one number for each bag and setting."""
+"""Outputs of a study: one number for each bag and setting, and what may be kept beside them."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cutting_trainer.exercises.metrics import Attempt
+from cutting_trainer.exercises.score import UNITS, score
+from cutting_trainer.recordings.export_command import write_solid
 from cutting_trainer.recordings.incision_metrics import surface_length
 from cutting_trainer.recordings.what_if import Run
 from cutting_trainer.tissue_sim.mesh.pieces import free_parts
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
+from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 
 @dataclass(frozen=True)
@@ -24,7 +34,8 @@ class Output:
     meaning: str
 
 
-OUTPUTS = {
+_SI_UNITS = {'mm': 'm', 'mm/s': 'm/s', 'mm^2': 'm^2', '%': ''}
+FIGURES = {
     'largest_force': Output('N', 'largest force on the hand'),
     'mean_force_in_contact': Output('N', 'mean force on the hand in contact'),
     'force_rms_difference': Output('N', 'rms difference to the force of the reference'),
@@ -38,13 +49,26 @@ OUTPUTS = {
     'substeps': Output('', 'substeps of all frames'),
     'frames_taken_back': Output('', 'frames that diverged and were taken back'),
 }
-"""All outputs by column."""
+"""Outputs of every bag, by column."""
+SCORE = 'exercise.score'
+MEASURES = {
+    SCORE: Output('', 'points of the exercise'),
+    **{
+        f'exercise.{name}': Output(_SI_UNITS.get(unit, unit), meaning)
+        for name, (_, unit, meaning) in UNITS.items()
+    },
+}
+"""Further outputs of bags of an exercise."""
+OUTPUTS = FIGURES | MEASURES
+FileName = Literal['force', 'tissue']
+FILES: dict[FileName, str] = {'force': 'force.parquet', 'tissue': 'tissue.vtu'}
+"""What a study may keep of each session, and its file."""
 COMPARED = ('force_rms_difference', 'largest_force_difference')
 """Those that compare with the reference."""
 
 
 def outputs_of(run: Run, reference: NDArray[np.float64], mesh: TetMesh) -> dict[str, float]:
-    """Compute all outputs of a session.
+    """Compute the outputs that every session has.
 
     Args:
         run: the session.
@@ -58,4 +82,39 @@ def outputs_of(run: Run, reference: NDArray[np.float64], mesh: TetMesh) -> dict[
         'incision_length': surface_length(mesh),
         'pieces': float(free_parts(mesh).max(initial=0)),
     }
-    return {name: float(values[name]) for name in OUTPUTS}
+    return {name: float(values[name]) for name in FIGURES}
+
+
+def measures_of(attempt: Attempt) -> dict[str, float]:
+    """Return score and measures of an attempt, without those that have no value."""
+    measures = attempt.measures()
+    points = score(attempt.exercise, measures).points
+    found = {SCORE: points} | {f'exercise.{name}': value for name, value in measures.items()}
+    return {name: float(value) for name, value in found.items() if not math.isnan(value)}
+
+
+def files_of(
+    run: Run, simulation: TissueSimulation, wanted: Iterable[FileName], folder: Path
+) -> dict[str, bytes]:
+    """Return the content of the files that a study keeps of a session, by name.
+
+    Args:
+        run: the session.
+        simulation: tissue at the end.
+        wanted: which of them.
+        folder: for the work.
+    """
+    found = dict[str, bytes]()
+    for name in wanted:
+        file = folder / FILES[name]
+        if name == 'force':
+            columns = dict(zip(('force_x', 'force_y', 'force_z'), run.vectors.T, strict=True))
+            times = {'time': run.times}
+            pq.write_table(pa.table(times | columns | {'contact': run.contact}), file)
+        else:
+            mesh = simulation.mesh
+            write_solid(
+                file, mesh.rest, simulation.positions - mesh.rest, mesh.tetrahedra, mesh.fixed
+            )
+        found[file.name] = file.read_bytes()
+    return found

@@ -31,10 +31,12 @@ from cutting_trainer.studies.description import Study, read_study
 from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.evaluation import Job, Result
 from cutting_trainer.studies.identity import identity_of_worker
-from cutting_trainer.studies.journal import Journal, key_of, open_journal
+from cutting_trainer.studies.journal import Journal, Key, key_of, open_journal
+from cutting_trainer.studies.outputs import FILES
 from cutting_trainer.studies.summary import PAGE_FILE, StudySummary, as_text, summarise, write_page
 from cutting_trainer.studies.table import COSTS_FILE, TABLE_FILE, Row, write_costs, write_table
 
+KEPT_FOLDER = 'kept'
 _TABLE_PERIOD_S = 5.0
 _MAX_TABLE_SHARE = 0.05
 """Share of the time that may go into tables of partial results."""
@@ -86,6 +88,7 @@ class Plan:
 
     Attributes:
         reference: setting whose force the others are compared with.
+        folder: of the results.
         lost: results that no worker could compute this time, by key.
     """
 
@@ -94,7 +97,8 @@ class Plan:
     settings: list[Setting]
     reference: Setting
     journal: Journal
-    lost: dict[tuple[str, str], Result]
+    folder: Path
+    lost: dict[Key, Result]
 
     @property
     def size(self) -> int:
@@ -103,13 +107,24 @@ class Plan:
 
     def jobs(self) -> list[Job]:
         """Return the rows to be computed, bag by bag, the session as recorded first."""
-        here = identity_of_worker()
+        here, keep = identity_of_worker(), tuple(self.study.keep)
         return [
-            Job(bag.place, bag.hash, setting, here, reference=self.reference)
+            Job(bag.place, bag.hash, setting, here, reference=self.reference, keep=keep)
             for bag in self.bags
             for setting in self.settings
-            if key_of(bag.hash, setting) not in self.journal.rows
+            if not self._is_done(key_of(bag.hash, setting))
         ]
+
+    def _is_done(self, key: Key) -> bool:
+        """Return whether a row is in the journal, and its files are in their folder."""
+        result = self.journal.rows.get(key)
+        if result is None or result.failure:
+            return result is not None
+        return all(self._kept(key, FILES[name]).is_file() for name in self.study.keep)
+
+    def _kept(self, key: Key, name: str) -> Path:
+        bag, setting = key
+        return self.folder / KEPT_FOLDER / f'{bag}_{setting or "recorded"}_{name}'
 
     def rows(self) -> list[Row]:
         """Return the rows that are done, in the order of bags and settings."""
@@ -126,8 +141,15 @@ class Plan:
         key = key_of(job.bag_hash, job.setting)
         if result.lost:
             self.lost[key] = result
-        else:
-            self.journal.append(key, result)
+            return
+        with _writing(self.folder):
+            for name, content in result.files.items():
+                file = self._kept(key, name)
+                file.parent.mkdir(exist_ok=True)
+                new = file.with_suffix('.new')
+                new.write_bytes(content)
+                new.replace(file)
+        self.journal.append(key, result)
 
 
 def run_study(options: StudyOptions) -> Status:
@@ -151,7 +173,7 @@ def run_study(options: StudyOptions) -> Status:
         )
     options.folder.mkdir(exist_ok=True)
     with open_journal(options.folder, identity_of_worker(), reference.identity) as journal:
-        plan = Plan(study, bags, settings, reference, journal, {})
+        plan = Plan(study, bags, settings, reference, journal, options.folder, {})
         interrupted = not _compute(plan, options, notes)
         _write_tables(options.folder, plan)
         rows = plan.rows()

@@ -79,6 +79,7 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
         outputs = [name for name in outputs if name not in COMPARED]
     every = effects_of_settings(rows, outputs, study.confidence)
     keys, why_not = effects_of_keys(_designed(rows), outputs, study.confidence)
+    known = {effect.output for effect in every}
     changed = {effect.output for effect in every if not effect.is_zero}
     settings = [effect for effect in every if effect.output in changed]
     failures = Counter(row.result.failure for row in rows if row.result.failure)
@@ -87,6 +88,9 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
         f'intervals: {study.confidence:.1%} by bootstrap over bags; effects are differences to the '
         'sessions as recorded',
     ]
+    done = [row.result.outputs for row in rows if not row.result.failure]
+    if done and (missing := [o for o in study.outputs if not any(o in values for values in done)]):
+        notes.append(f'no bag has {", ".join(missing)}')
     counts = {effect.bags for effect in every}
     if counts and min(counts) < MIN_BAGS:
         notes.append(
@@ -108,7 +112,7 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
         settings=_by_output(settings, outputs),
         keys=_by_output([effect for effect in keys if effect.output in changed], outputs),
         tradeoffs=tradeoffs(rows, study.confidence),
-        unchanged=[name for name in outputs if name not in changed and every],
+        unchanged=[name for name in outputs if name in known - changed],
         failures=dict(failures.most_common()),
         notes=notes,
     )

@@ -4,20 +4,26 @@ import json
 import os
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import meshio
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
 from cutting_trainer.bags.errors import BagError
+from cutting_trainer.bags.reader import open_bag
+from cutting_trainer.bags.recorded_tissue import tissue_at
 from cutting_trainer.exercises.attempt_store import AttemptRow
+from cutting_trainer.exercises.scene_schema import ExerciseSettings
 from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.session.attempts import open_store
 from cutting_trainer.session.errors import SessionError
+from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.studies import evaluation
 from cutting_trainer.studies.accuracy_and_cost import tradeoff_figure, tradeoffs
 from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find_bags, hash_of_bag
@@ -28,9 +34,9 @@ from cutting_trainer.studies.effects import effects_of_keys, effects_of_settings
 from cutting_trainer.studies.evaluation import Job, Result, read_recording
 from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.journal import JOURNAL_FILE, Journal, key_of, open_journal
-from cutting_trainer.studies.outputs import OUTPUTS
+from cutting_trainer.studies.outputs import FIGURES, OUTPUTS
 from cutting_trainer.studies.remote_bags import UnavailableError
-from cutting_trainer.studies.study_command import bags_of
+from cutting_trainer.studies.study_command import Plan, bags_of
 from cutting_trainer.studies.summary import as_text, summarise, write_page
 from cutting_trainer.studies.table import Row, write_table
 
@@ -264,7 +270,7 @@ def test_a_reference_whose_mesh_has_changed_is_computed_anew(monkeypatch, tmp_pa
     monkeypatch.setattr(
         evaluation,
         '_compute',
-        lambda *_: (SimpleNamespace(forces=np.full(3, next(forces))), None, 0),
+        lambda *_: SimpleNamespace(run=SimpleNamespace(forces=np.full(3, next(forces)))),
     )
     mesh = tmp_path / 'fine.vtk'
     for text, force in (('coarse', 1.0), ('fine', 2.0), ('fine', 2.0)):
@@ -273,6 +279,82 @@ def test_a_reference_whose_mesh_has_changed_is_computed_anew(monkeypatch, tmp_pa
                   reference=Setting(1, {'tissue.mesh': str(mesh)}))  # fmt: skip
         found, why_not = evaluation._reference_forces(job)
         assert not why_not and found is not None and found[0] == force
+
+
+def test_a_row_has_the_score_of_its_exercise(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(evaluation, 'warm_up', lambda: None)
+    exercise = {
+        'title': 'cut along x',
+        'targets': [{'name': 'line', 'points': [[-0.012, 0.003, 0.01], [0.01, 0.003, 0.01]],
+                     'depth': [0.001, 0.006]}],
+        'criteria': [{'measure': 'coverage', 'good': 1.0, 'bad': 0.0}],
+    }  # fmt: skip
+    bag = tmp_path / 'exercise'
+    shutil.copytree(SAMPLES / 'straight_cut', bag)
+    monkeypatch.setattr(evaluation, 'load_scene', with_exercise(exercise))
+    again, recorded, tough = (
+        evaluation.evaluate(Job(str(bag), hash_of_bag(bag), setting, identity_of_worker()))
+        for setting in (
+            Setting(1, {}),
+            RECORDED,
+            Setting(2, {'tissue.material.toughness': 1e4, 'tissue.cut_threshold': 90.0}),
+        )
+    )
+    kept = {n: v for n, v in again.outputs.items() if n.startswith('exercise.')}
+    assert kept.keys() <= OUTPUTS.keys() and kept['exercise.score'] > 80.0
+    assert kept['exercise.score'] == pytest.approx(100 * kept['exercise.coverage'])
+    # The whole loop computed again is the session as recorded, but for what comes after its last
+    # frame, when the hand is at rest.
+    for name, value in kept.items():
+        near = pytest.approx(recorded.outputs[name], rel=0.02, abs=1e-4)
+        assert value == near or name == 'exercise.idle', name
+    assert kept['exercise.idle'] == pytest.approx(recorded.outputs['exercise.idle'], abs=0.02)
+    assert tough.outputs['exercise.score'] == 0.0 == tough.outputs['exercise.coverage']
+    assert tough.outputs['exercise.path_length'] == pytest.approx(kept['exercise.path_length'])
+
+
+def with_exercise(exercise: dict[str, object]) -> Callable[[str], Scene]:
+    def load(path: str) -> Scene:
+        return replace(load_scene(path), exercise=ExerciseSettings.model_validate(exercise))
+
+    return load
+
+
+def test_a_row_keeps_its_force_and_its_tissue(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(evaluation, 'warm_up', lambda: None)
+    (bag,) = find_bags(['straight_cut'], SAMPLES)
+    asked = study(tmp_path, GOOD.replace('outputs:', 'keep: [force, tissue]\noutputs:'))
+    with open_journal(tmp_path, identity_of_worker()) as journal:
+        plan = Plan(asked, [bag], [RECORDED], RECORDED, journal, tmp_path, {})
+        (job,) = plan.jobs()
+        row = evaluation.evaluate(job)
+        plan.take(job, row)
+        assert not plan.jobs()
+        name = tmp_path / 'kept' / f'{bag.hash}_recorded_'
+        force = pq.read_table(f'{name}force.parquet').to_pydict()
+        felt = read_recording(bag.place, bag.hash).felt
+        columns = [force[f'force_{axis}'] for axis in 'xyz']
+        assert np.array_equal(np.array(columns).T, felt.vectors)
+        assert np.diff(force['time']) == pytest.approx(0.01, abs=5e-3)
+        tissue = meshio.read(f'{name}tissue.vtu')
+        assert len(tissue.cells_dict['tetra']) == row.outputs['tetrahedra']
+        recorded = tissue_at(open_bag(bag.path))
+        assert tissue.points == pytest.approx(recorded.positions(), abs=1e-6)
+        Path(f'{name}tissue.vtu').unlink()
+        assert [again.setting for again in plan.jobs()] == [RECORDED]
+        assert 'force.parquet' not in (tmp_path / JOURNAL_FILE).read_text()
+
+
+def test_an_output_that_some_bags_lack_has_the_effects_of_the_others() -> None:
+    settings = [Setting(1, {'s.x': 1}), Setting(2, {'s.x': 2})]
+    rows = made_rows(3, settings, np.array([[0.0, 1.0, 2.0]] * 3))
+    for n, row in enumerate(rows[3:]):  # two of three bags are of an exercise
+        row.result.outputs['exercise.score'] = 50.0 + 5.0 * (n % 3)
+    found = effects_of_settings(rows, ['exercise.score', 'largest_force'], 0.95)
+    assert [(e.mean, e.bags) for e in found] == [(5.0, 2), (1.0, 3), (10.0, 2), (2.0, 3)]
+    keys, _ = effects_of_keys(rows, ['exercise.score', 'largest_force', 'exercise.order'], 0.95)
+    assert [(e.output, e.bags) for e in keys] == [('exercise.score', 2), ('largest_force', 3)]
+    assert [e.mean for e in keys] == pytest.approx([5.0, 1.0])
 
 
 def test_hypercube_has_one_sample_in_each_part_of_a_range_and_sobol_too(tmp_path: Path) -> None:
@@ -400,7 +482,7 @@ def test_a_study_takes_bags_and_attempts_each_content_once(tmp_path: Path) -> No
 
 
 def result(force: float, failure: str = '') -> Result:
-    values = dict.fromkeys(OUTPUTS, 0.0) | {'largest_force': force}
+    values = dict.fromkeys(FIGURES, 0.0) | {'largest_force': force}
     return Result({} if failure else values, failure, 0, identity_of_worker(), 1.0, 0.0, 1)
 
 
