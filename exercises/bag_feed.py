@@ -1,5 +1,9 @@
 """Attempts from bags: every measure comes from the bag alone."""
 
+import math
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from cutting_trainer.bags.playback_messages import first_time
@@ -17,7 +21,9 @@ MOTION_FIELDS = [
 """Places in a contact of what `Attempt.add_motion` takes after the time."""
 
 
-def read_attempt(bag: Bag, exercise: ExerciseSettings) -> Attempt:
+def read_attempt(
+    bag: Bag, exercise: ExerciseSettings, answers: tuple[np.ndarray, np.ndarray] | None = None
+) -> Attempt:
     """Return the attempt that a bag records.
 
     Times are those of the device poses for the motion, and of the messages' stamps for the force:
@@ -26,6 +32,8 @@ def read_attempt(bag: Bag, exercise: ExerciseSettings) -> Attempt:
     Args:
         bag: of a session.
         exercise: of its scene.
+        answers: stamps [ns] of the poses that count, and the norm of the force in answer to each
+            [N], both shape (n,); None: all poses, and all forces at their own times.
 
     Raises:
         BagError: a part of the bag is damaged.
@@ -34,8 +42,9 @@ def read_attempt(bag: Bag, exercise: ExerciseSettings) -> Attempt:
     servo_cf = of_session(SERVO_CF, bag.topics())
     contacts, wrenches = ContactCodec(), WrenchStampedCodec()
     force = WrenchStampedCodec.fields['force']
-    motion: list[list[float]] = []
-    forces: list[tuple[float, ...]] = []
+    motion: list[tuple[float, ...]] = []
+    forces: list[tuple[float, float]] = []
+    first, last = (1, math.inf) if answers is None else (answers[0][0], answers[0][-1])
     replica, topology = MeshReplica(), -1
     origin = first_time(bag)
     keyframe = first_current_keyframe(bag)
@@ -43,22 +52,41 @@ def read_attempt(bag: Bag, exercise: ExerciseSettings) -> Attempt:
     for message in bag.messages([CONTACT, servo_cf, MESH, UPDATES]):
         if message.topic == CONTACT:
             stamp, _, values = contacts.decode(message.data)
-            if stamp:  # 0: there was no device yet
-                row = (x for place in MOTION_FIELDS for x in values[place])
-                motion.append([(stamp - origin) * 1e-9, *row])
+            if first <= stamp <= last:  # 0: there was no device yet
+                motion.append(((stamp - origin) * 1e-9, *motion_of(values)))
         elif message.topic == servo_cf:
             stamp, _, values = wrenches.decode(message.data)
-            forces.append(((stamp - origin) * 1e-9, *values[force]))
+            forces.append(((stamp - origin) * 1e-9, math.hypot(*values[force])))
         elif message.log_time >= known_from:
             follow(replica, message.topic, bag.read(message))
             if replica.topology != topology:
                 topology = replica.topology
                 attempt.see_tissue((message.log_time - origin) * 1e-9, replica)
-    attempt.add_motion(_in_order(np.array(motion, float).reshape(-1, 11)))
-    table = _in_order(np.array(forces, float).reshape(-1, 4))
-    norm = np.linalg.norm(table[:, 1:], axis=1)
-    attempt.add_forces(np.column_stack([table[:, 0], norm]))
+    if answers is not None:
+        forces = list(zip((answers[0] - origin) * 1e-9, answers[1], strict=True))
+    add_samples(attempt, motion, forces)
     return attempt
+
+
+def motion_of(contact: Sequence[Any]) -> list[float]:
+    """Return what `Attempt.add_motion` takes after the time from the values of a contact."""
+    return [x for place in MOTION_FIELDS for x in contact[place]]
+
+
+def add_samples(
+    attempt: Attempt,
+    motion: Sequence[tuple[float, ...]],
+    forces: Sequence[tuple[float, float]],
+) -> None:
+    """Add samples in any order to an attempt, each time once.
+
+    Args:
+        attempt: that sees them.
+        motion: rows of `Attempt.add_motion`.
+        forces: rows of `Attempt.add_forces`.
+    """
+    attempt.add_motion(_in_order(np.array(motion, float).reshape(-1, 11)))
+    attempt.add_forces(_in_order(np.array(forces, float).reshape(-1, 2)))
 
 
 def _in_order(samples: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from cutting_trainer.bags.recorded_indexings import recorded_indexings
 from cutting_trainer.bags.resimulation import Resimulation, answer_frames, as_recorded
 from cutting_trainer.bags.resimulation_start import find_beginning
 from cutting_trainer.bags.topic_names import CONTACT, POSE, SERVO_CF, of_session
-from cutting_trainer.exercises.bag_feed import MOTION_FIELDS
+from cutting_trainer.exercises.bag_feed import add_samples, motion_of
 from cutting_trainer.exercises.metrics import Attempt
 from cutting_trainer.haptic_bridge.force_kernels import NONE
 from cutting_trainer.haptic_bridge.force_path import ForcePath
@@ -141,7 +141,8 @@ class Hand:
         ticks: time [ns], norm of the force [N], contact flag and force [N] of each tick.
         indexings: recorded changes of how the hand moves the tool, that are to come.
         indexing: the last one; None before the first.
-        motion: rows of `Attempt.add_motion`, with the stamp of the pose [ns] for the time.
+        motion: stamp of the pose [ns], and the rest of a row of `Attempt.add_motion`, for each
+            tick; None: nobody wants them.
     """
 
     path: ForcePath
@@ -153,7 +154,7 @@ class Hand:
     ticks: list[tuple[int, float, bool, tuple[float, ...]]] = field(default_factory=list)
     indexings: deque[Indexing] = field(default_factory=deque)
     indexing: Indexing | None = None
-    motion: list[tuple[float, ...]] = field(default_factory=list)
+    motion: list[tuple[int, list[float]]] | None = None
 
     def index(self, until: int) -> None:
         """Clutch, and change the scale of the motion, as before a device pose, by its stamp [ns].
@@ -189,9 +190,8 @@ class Hand:
         if self.state is CrtkState.DISABLED and self.path.is_fresh(now):
             self.state = CrtkState.ENABLED
         self.contact = StampedMessage(tick.contact_stamp_ns, '', tick.contact)
-        if tick.contact_stamp_ns:  # 0: there was no device yet
-            row = (x for place in MOTION_FIELDS for x in tick.contact[place])
-            self.motion.append((tick.contact_stamp_ns, *row))
+        if self.motion is not None and tick.contact_stamp_ns:  # 0: there was no device yet
+            self.motion.append((tick.contact_stamp_ns, motion_of(self.contact.values)))
         force = tick.wrench[WrenchStampedCodec.fields['force']]
         self.ticks.append((now, self.path.force_norm, self.path.contact != NONE, force))
 
@@ -245,7 +245,8 @@ def move_hand(
     Raises:
         SessionError: the changed session ends in a FAULT.
     """
-    hand = Hand(make_force_path(scene), indexings=deque(indexings))
+    motion: list[tuple[int, list[float]]] | None = None if attempt is None else []
+    hand = Hand(make_force_path(scene), indexings=deque(indexings), motion=motion)
     untils = (hand.follow(record) for record in records)
     computed.answer_frames = answer_frames(records)
     topology = -1
@@ -257,11 +258,10 @@ def move_hand(
             attempt.see_tissue((now - poses[0].stamp_ns) * _NANOSECOND_S, mesh)
     times, forces, contact, vectors = map(np.array, zip(*hand.ticks, strict=True))
     run = _run(RecordedForce(times, forces, contact, vectors), computed)
-    if attempt is not None:
-        motion = np.array(hand.motion)
-        motion[:, 0] = (motion[:, 0] - times[0]) * _NANOSECOND_S
-        attempt.add_motion(motion)
-        attempt.add_forces(np.column_stack([run.times, run.forces]))
+    if attempt is not None and motion is not None:
+        first = poses[0].stamp_ns
+        rows = [((stamp - first) * _NANOSECOND_S, *row) for stamp, row in motion]
+        add_samples(attempt, rows, list(zip(run.times, run.forces, strict=True)))
     return run
 
 

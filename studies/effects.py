@@ -107,6 +107,9 @@ def effects_of_keys(
         return [], ''
     design = np.column_stack([np.ones(len(settings)), *columns.values()])
     values = _by_setting(rows)
+    known = {output for of in values.values() for done in of.values() for output in done}
+    if not known.intersection(outputs):
+        return [], ''
     found: dict[tuple[str, str], list[float]] = {}
     for output in outputs:
         for bag in values.get(RECORDED.identity, {}):

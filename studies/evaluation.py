@@ -47,7 +47,8 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.studies.bag_collection import folder_of, hash_of_bag, require
 from cutting_trainer.studies.designs import RECORDED, Setting
 from cutting_trainer.studies.identity import Identity, identity_of_worker
-from cutting_trainer.studies.outputs import FileName, files_of, measures_of, outputs_of
+from cutting_trainer.studies.kept_files import contents_of
+from cutting_trainer.studies.outputs import FileName, measures_of, outputs_of
 from cutting_trainer.studies.remote_bags import UnavailableError, without_copies
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.warm_up import warm_up as warm_up_tissue
@@ -103,7 +104,9 @@ class Result:
         lost: no worker has computed it, for a reason that is not that of bag or setting.
         series: force on the hand at each pose [N], shape (n, 3), where the job asks for it.
         reference: identity of the setting that it is compared with.
-        files: content of the files that the job asks for, by name.
+        files: content of the files that the job asks for, by name; they go no further than to
+            whoever asks.
+        kept: their hashes, by name, once they are kept.
     """
 
     outputs: dict[str, float]
@@ -116,7 +119,8 @@ class Result:
     lost: bool = False
     series: Floats | None = None
     reference: str = ''
-    files: dict[str, bytes] = field(default_factory=dict)
+    files: dict[FileName, bytes] = field(default_factory=dict)
+    kept: dict[str, str] = field(default_factory=dict)
 
 
 class OtherCodeError(RuntimeError):
@@ -155,23 +159,26 @@ def evaluate(job: Job) -> Result:
     began = time.thread_time()
     warm_up()
     warm, differs, failure, outputs = time.thread_time(), 0, '', dict[str, float]()
-    lost, series, files = False, None, dict[str, bytes]()
+    lost, series, files = False, None, dict[FileName, bytes]()
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
             reference, why_not = _reference_forces(job) if job.reference.number else (None, '')
             warm = time.thread_time()
             if why_not:
                 raise SessionError(why_not)
-            done = _compute(job.bag, job.bag_hash, job.setting, Path(temporary))
+            session = job.bag, job.bag_hash, job.setting, Path(temporary)
+            done = _compute(*session, watched=not job.series)
             run, simulation, differs = done.run, done.simulation, done.differs
             if reference is None:
                 reference = read_recording(job.bag, job.bag_hash).felt.forces
             outputs = outputs_of(run, reference, simulation.mesh)
+            cpu = time.thread_time() - warm
             if done.attempt is not None:
                 outputs |= measures_of(done.attempt)
             series = run.vectors if job.series else None
-            files = files_of(run, simulation, job.keep, Path(temporary))
+            files = contents_of(run, simulation, job.keep, Path(temporary))
         except Exception as error:  # a row with its reason: the study goes on
+            cpu, outputs = time.thread_time() - warm, {}
             failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
             lost = isinstance(error, _PASSING)
     return Result(
@@ -179,7 +186,7 @@ def evaluate(job: Job) -> Result:
         failure=failure,
         differs_from_frame=differs,
         identity=here,
-        cpu=time.thread_time() - warm,
+        cpu=cpu,
         warm_up=warm - began,
         memory=_largest_memory(),
         lost=lost,
@@ -228,7 +235,8 @@ def _forces_under(
     setting = Setting(1, json.loads(changes))
     with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
         try:
-            forces = _compute(bag, bag_hash, setting, Path(temporary)).run.forces
+            session = bag, bag_hash, setting, Path(temporary)
+            forces = _compute(*session, watched=False).run.forces
         except UnavailableError as error:
             raise UnavailableError(f'the reference: {error}') from None
         except (OSError, MemoryError):
@@ -254,15 +262,17 @@ class _Session:
     differs: int
 
 
-def _compute(place: str, bag_hash: str, setting: Setting, temporary: Path) -> _Session:
-    """Compute a session under a setting."""
+def _compute(
+    place: str, bag_hash: str, setting: Setting, temporary: Path, *, watched: bool
+) -> _Session:
+    """Compute a session under a setting; its exercise, if that is watched."""
     recording = read_recording(place, bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
     if setting.mesh is not None:
         require(setting.mesh)
     scene = load_scene(str(restore_scene(bag, temporary, setting.in_yaml)))
     changed, differs = setting.number > 0, None
-    attempt = Attempt(scene.exercise) if scene.exercise.title else None
+    attempt = Attempt(scene.exercise) if watched and scene.exercise.title else None
     refuse_lost_changes(bag, setting.changes)
     computed = recomputation(scene, beginning, changed=changed)
     if changed:
@@ -271,7 +281,8 @@ def _compute(place: str, bag_hash: str, setting: Setting, temporary: Path) -> _S
     else:
         differs = recompute(recording.records, computed)
         run = as_felt(felt, computed)
-        attempt = attempt and read_attempt(bag, scene.exercise)
+        if attempt is not None:
+            attempt = read_attempt(bag, scene.exercise, (felt.times, felt.forces))
     return _Session(run, computed.simulation, attempt, differs or 0)
 
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from cutting_trainer.node_common.code_identity import hash_of_sources, identity_here
 from cutting_trainer.node_common.share_folder import ROOMS, share_folder
 
-CODE = ('node_common', 'bags', 'session', 'recordings', 'studies')
+CODE = ('node_common', 'bags', 'session', 'exercises', 'recordings', 'studies')
 """Packages that decide the numbers of a row beside those with kernels."""
 _HASH_DIGITS = 16
 _MACHINE = ('commit', 'cpu', 'target', 'features')

@@ -5,7 +5,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ class Journal:
         Raises:
             SessionError: it cannot be written.
         """
-        line = json.dumps({'key': key, **asdict(replace(result, files={}))}) + '\n'
+        line = json.dumps({'key': key, **asdict(result)}) + '\n'
         data = memoryview(line.encode())
         try:
             while data:

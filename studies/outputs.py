@@ -1,24 +1,18 @@
-"""Outputs of a study: one number for each bag and setting, and what may be kept beside them."""
+"""Outputs of a study: one number for each bag and setting."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cutting_trainer.exercises.metrics import Attempt
 from cutting_trainer.exercises.score import UNITS, score
-from cutting_trainer.recordings.export_command import write_solid
 from cutting_trainer.recordings.incision_metrics import surface_length
 from cutting_trainer.recordings.what_if import Run
 from cutting_trainer.tissue_sim.mesh.pieces import free_parts
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
-from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
 
 @dataclass(frozen=True)
@@ -61,8 +55,7 @@ MEASURES = {
 """Further outputs of bags of an exercise."""
 OUTPUTS = FIGURES | MEASURES
 FileName = Literal['force', 'tissue']
-FILES: dict[FileName, str] = {'force': 'force.parquet', 'tissue': 'tissue.vtu'}
-"""What a study may keep of each session, and its file."""
+"""What a study may keep of each session."""
 COMPARED = ('force_rms_difference', 'largest_force_difference')
 """Those that compare with the reference."""
 
@@ -91,30 +84,3 @@ def measures_of(attempt: Attempt) -> dict[str, float]:
     points = score(attempt.exercise, measures).points
     found = {SCORE: points} | {f'exercise.{name}': value for name, value in measures.items()}
     return {name: float(value) for name, value in found.items() if not math.isnan(value)}
-
-
-def files_of(
-    run: Run, simulation: TissueSimulation, wanted: Iterable[FileName], folder: Path
-) -> dict[str, bytes]:
-    """Return the content of the files that a study keeps of a session, by name.
-
-    Args:
-        run: the session.
-        simulation: tissue at the end.
-        wanted: which of them.
-        folder: for the work.
-    """
-    found = dict[str, bytes]()
-    for name in wanted:
-        file = folder / FILES[name]
-        if name == 'force':
-            columns = dict(zip(('force_x', 'force_y', 'force_z'), run.vectors.T, strict=True))
-            times = {'time': run.times}
-            pq.write_table(pa.table(times | columns | {'contact': run.contact}), file)
-        else:
-            mesh = simulation.mesh
-            write_solid(
-                file, mesh.rest, simulation.positions - mesh.rest, mesh.tetrahedra, mesh.fixed
-            )
-        found[file.name] = file.read_bytes()
-    return found

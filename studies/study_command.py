@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
@@ -32,11 +32,10 @@ from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
 from cutting_trainer.studies.evaluation import Job, Result
 from cutting_trainer.studies.identity import identity_of_worker
 from cutting_trainer.studies.journal import Journal, Key, key_of, open_journal
-from cutting_trainer.studies.outputs import FILES
+from cutting_trainer.studies.kept_files import are_kept, keep
 from cutting_trainer.studies.summary import PAGE_FILE, StudySummary, as_text, summarise, write_page
 from cutting_trainer.studies.table import COSTS_FILE, TABLE_FILE, Row, write_costs, write_table
 
-KEPT_FOLDER = 'kept'
 _TABLE_PERIOD_S = 5.0
 _MAX_TABLE_SHARE = 0.05
 """Share of the time that may go into tables of partial results."""
@@ -107,9 +106,9 @@ class Plan:
 
     def jobs(self) -> list[Job]:
         """Return the rows to be computed, bag by bag, the session as recorded first."""
-        here, keep = identity_of_worker(), tuple(self.study.keep)
+        here, wanted = identity_of_worker(), tuple(self.study.keep)
         return [
-            Job(bag.place, bag.hash, setting, here, reference=self.reference, keep=keep)
+            Job(bag.place, bag.hash, setting, here, reference=self.reference, keep=wanted)
             for bag in self.bags
             for setting in self.settings
             if not self._is_done(key_of(bag.hash, setting))
@@ -120,15 +119,11 @@ class Plan:
         result = self.journal.rows.get(key)
         if result is None or result.failure:
             return result is not None
-        return all(self._kept(key, FILES[name]).is_file() for name in self.study.keep)
-
-    def _kept(self, key: Key, name: str) -> Path:
-        bag, setting = key
-        return self.folder / KEPT_FOLDER / f'{bag}_{setting or "recorded"}_{name}'
+        return are_kept(self.folder, key, self.study.keep, result.kept)
 
     def rows(self) -> list[Row]:
         """Return the rows that are done, in the order of bags and settings."""
-        results = self.lost | self.journal.rows
+        results = self.journal.rows | self.lost
         return [
             Row(bag, setting, results[key])
             for bag in self.bags
@@ -143,13 +138,8 @@ class Plan:
             self.lost[key] = result
             return
         with _writing(self.folder):
-            for name, content in result.files.items():
-                file = self._kept(key, name)
-                file.parent.mkdir(exist_ok=True)
-                new = file.with_suffix('.new')
-                new.write_bytes(content)
-                new.replace(file)
-        self.journal.append(key, result)
+            kept = keep(self.folder, key, result.files)
+        self.journal.append(key, replace(result, files={}, kept=kept))
 
 
 def run_study(options: StudyOptions) -> Status:
@@ -212,6 +202,8 @@ def _compute(plan: Plan, options: StudyOptions, notes: Console) -> bool:
             'beside another reference, and are computed again',
             highlight=False,
         )
+    if fileless := len(plan.journal.rows.keys() & wanted):
+        notes.print(f'{fileless} rows lack files, and are computed again', highlight=False)
     if not jobs:
         return True
     from cutting_trainer.studies.cluster import compute

@@ -88,9 +88,8 @@ def summarise(rows: Sequence[Row], study: Study, planned: int) -> StudySummary:
         f'intervals: {study.confidence:.1%} by bootstrap over bags; effects are differences to the '
         'sessions as recorded',
     ]
-    done = [row.result.outputs for row in rows if not row.result.failure]
-    if done and (missing := [o for o in study.outputs if not any(o in values for values in done)]):
-        notes.append(f'no bag has {", ".join(missing)}')
+    if every and (missing := [name for name in outputs if name not in known]):
+        notes.append(f'without a value as recorded, and so without an effect: {", ".join(missing)}')
     counts = {effect.bags for effect in every}
     if counts and min(counts) < MIN_BAGS:
         notes.append(

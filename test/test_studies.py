@@ -270,7 +270,7 @@ def test_a_reference_whose_mesh_has_changed_is_computed_anew(monkeypatch, tmp_pa
     monkeypatch.setattr(
         evaluation,
         '_compute',
-        lambda *_: SimpleNamespace(run=SimpleNamespace(forces=np.full(3, next(forces)))),
+        lambda *_, **__: SimpleNamespace(run=SimpleNamespace(forces=np.full(3, next(forces)))),
     )
     mesh = tmp_path / 'fine.vtk'
     for text, force in (('coarse', 1.0), ('fine', 2.0), ('fine', 2.0)):
@@ -303,12 +303,8 @@ def test_a_row_has_the_score_of_its_exercise(monkeypatch, tmp_path: Path) -> Non
     kept = {n: v for n, v in again.outputs.items() if n.startswith('exercise.')}
     assert kept.keys() <= OUTPUTS.keys() and kept['exercise.score'] > 80.0
     assert kept['exercise.score'] == pytest.approx(100 * kept['exercise.coverage'])
-    # The whole loop computed again is the session as recorded, but for what comes after its last
-    # frame, when the hand is at rest.
-    for name, value in kept.items():
-        near = pytest.approx(recorded.outputs[name], rel=0.02, abs=1e-4)
-        assert value == near or name == 'exercise.idle', name
-    assert kept['exercise.idle'] == pytest.approx(recorded.outputs['exercise.idle'], abs=0.02)
+    for name, value in kept.items():  # the whole loop computed again is the session as recorded
+        assert value == pytest.approx(recorded.outputs[name], rel=5e-3, abs=1e-6), name
     assert tough.outputs['exercise.score'] == 0.0 == tough.outputs['exercise.coverage']
     assert tough.outputs['exercise.path_length'] == pytest.approx(kept['exercise.path_length'])
 
@@ -340,7 +336,8 @@ def test_a_row_keeps_its_force_and_its_tissue(monkeypatch, tmp_path: Path) -> No
         assert len(tissue.cells_dict['tetra']) == row.outputs['tetrahedra']
         recorded = tissue_at(open_bag(bag.path))
         assert tissue.points == pytest.approx(recorded.positions(), abs=1e-6)
-        Path(f'{name}tissue.vtu').unlink()
+        assert not any(result.files for result in journal.rows.values())
+        Path(f'{name}tissue.vtu').write_bytes(b'of other code')
         assert [again.setting for again in plan.jobs()] == [RECORDED]
         assert 'force.parquet' not in (tmp_path / JOURNAL_FILE).read_text()
 
