@@ -52,6 +52,10 @@ def refused(status: dict[str, str]) -> int:
     return sum(int(value) for key, value in status.items() if key.startswith('refused '))
 
 
+MAX_POSE_GAP_S = 0.015
+"""Longest time between two poses in a session that counts; the bridge comes to a FAULT at 20 ms."""
+
+
 @dataclass
 class Record:
     """What happened, by the clock of this machine."""
@@ -70,6 +74,10 @@ class Record:
         start = self.marks[after] + delay * 1e9
         end = self.marks[before] if before else np.inf
         return np.array([w.values[2] for w in self.wrenches if start <= w.stamp_ns < end])
+
+
+class HeldUpError(AssertionError):
+    """The device, which this test is, was itself kept from running."""
 
 
 class World:
@@ -132,7 +140,11 @@ class World:
         """Waits until the bridge has announced a state."""
         end = time.monotonic() + timeout
         while not self.record.states or self.record.states[-1][1] != state:
-            assert time.monotonic() < end, f'no {state}: {self.record.states}'
+            if time.monotonic() >= end:
+                said = f'no {state}: {self.record.states}'
+                if (gap := self.record.longest_pose_gap) >= MAX_POSE_GAP_S:
+                    raise HeldUpError(f'{said}; the device was held up for {gap:.3f} s')
+                raise AssertionError(said)
             time.sleep(0.01)
 
     def wait_until(self, condition: Callable[[], bool], timeout: float = 5.0) -> None:

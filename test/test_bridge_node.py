@@ -8,9 +8,11 @@ import pytest
 from bridge_world import (
     ABOVE,
     DEPTH,
+    MAX_POSE_GAP_S,
     PRESSED,
     RADIUS,
     SCHEDULING,
+    HeldUpError,
     K,
     Record,
     World,
@@ -98,10 +100,15 @@ def record(tmp_path_factory):
     for _ in range(3):
         scene = tmp_path_factory.mktemp('bridge') / 'flat.yaml'
         scene.write_text(SCENE)
-        recorded = session(scene, free_domain(), play)
-        if recorded.longest_pose_gap < 0.015:
+        try:
+            recorded = session(scene, free_domain(), play)
+        except HeldUpError as error:
+            said = str(error)
+            continue
+        if recorded.longest_pose_gap < MAX_POSE_GAP_S:
             return recorded
-    pytest.fail(f'this machine held the device up for {recorded.longest_pose_gap:.3f} s')
+        said = f'this machine held the device up for {recorded.longest_pose_gap:.3f} s'
+    pytest.fail(said)
 
 
 def test_force_is_zero_before_contact_and_rises_with_depth(record):
