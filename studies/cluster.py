@@ -235,13 +235,13 @@ def _result(future: Any, job: Job) -> Result:
 def lost(job: Job, reason: str) -> Result:
     """Return the result of a row that no worker could compute."""
     return Result(
-        {},
-        reason,
-        0,
-        replace(job.identity, cpu=''),
-        0.0,
-        0.0,
-        0,
+        outputs={},
+        failure=reason,
+        differs_from_frame=0,
+        identity=replace(job.identity, cpu=''),
+        cpu=0.0,
+        warm_up=0.0,
+        memory=0,
         lost=True,
         reference=job.reference.identity,
     )

@@ -20,6 +20,8 @@ _DIGITS = 6
 """Significant digits of a sampled value: it is read by people, too."""
 _HASH_DIGITS = 16
 MESH_KEY = 'tissue.mesh'
+Key = tuple[str, str]
+"""Of a row: hash of its bag and identity of its setting."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """One row of a study, computed by a worker: a bag under a setting."""
 
 import json
+import re
 import tempfile
 import time
 import traceback
@@ -59,6 +60,9 @@ Floats = NDArray[np.float64]
 _SENTENCES = (BagError, SessionError, SceneError, MeshError, SettingsError)
 _PASSING = (UnavailableError, OSError, MemoryError)
 """Errors of a machine, which another start may not meet."""
+_TEMPORARY = 'trainer-'
+_OWN_FOLDER = re.compile(rf'{re.escape(tempfile.gettempdir())}/{_TEMPORARY}\w+/')
+"""Folder of one row: reasons of equal rows are equal."""
 _MAX_REASON = 500
 """Characters of a reason."""
 _KEPT_BAGS = 2
@@ -160,27 +164,25 @@ def evaluate(job: Job) -> Result:
     warm_up()
     warm, differs, failure, outputs = time.thread_time(), 0, '', dict[str, float]()
     lost, series, files = False, None, dict[FileName, bytes]()
-    with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
-        try:
-            reference, why_not = _reference_forces(job) if job.reference.number else (None, '')
-            warm = time.thread_time()
-            if why_not:
-                raise SessionError(why_not)
-            session = job.bag, job.bag_hash, job.setting, Path(temporary)
-            done = _compute(*session, watched=not job.series)
-            run, simulation, differs = done.run, done.simulation, done.differs
-            if reference is None:
-                reference = read_recording(job.bag, job.bag_hash).felt.forces
-            outputs = outputs_of(run, reference, simulation.mesh)
-            cpu = time.thread_time() - warm
-            if done.attempt is not None:
-                outputs |= measures_of(done.attempt)
-            series = run.vectors if job.series else None
-            files = contents_of(run, simulation, job.keep, Path(temporary))
-        except Exception as error:  # a row with its reason: the study goes on
-            cpu, outputs = time.thread_time() - warm, {}
-            failure = _reason(error).replace(f'{temporary}/', '')[:_MAX_REASON]
-            lost = isinstance(error, _PASSING)
+    try:
+        reference, why_not = _reference_forces(job) if job.reference.number else (None, '')
+        warm = time.thread_time()
+        if why_not:
+            raise SessionError(why_not)
+        done = _compute(job.bag, job.bag_hash, job.setting, watched=not job.series)
+        run, simulation, differs = done.run, done.simulation, done.differs
+        if reference is None:
+            reference = read_recording(job.bag, job.bag_hash).felt.forces
+        outputs = outputs_of(run, reference, simulation.mesh)
+        cpu = time.thread_time() - warm
+        if done.attempt is not None:
+            outputs |= measures_of(done.attempt)
+        series = run.vectors if job.series else None
+        files = contents_of(run, simulation, job.keep)
+    except Exception as error:  # a row with its reason: the study goes on
+        cpu, outputs = time.thread_time() - warm, {}
+        failure = _reason(error)[:_MAX_REASON]
+        lost = isinstance(error, _PASSING)
     return Result(
         outputs=outputs,
         failure=failure,
@@ -232,18 +234,15 @@ def _forces_under(
     identity: str, changes: str, bag: str, bag_hash: str
 ) -> tuple[Floats | None, str]:
     """Compute the forces of a setting. Its identity stands for the content of its mesh."""
-    setting = Setting(1, json.loads(changes))
-    with tempfile.TemporaryDirectory(prefix='trainer-') as temporary:
-        try:
-            session = bag, bag_hash, setting, Path(temporary)
-            forces = _compute(*session, watched=False).run.forces
-        except UnavailableError as error:
-            raise UnavailableError(f'the reference: {error}') from None
-        except (OSError, MemoryError):
-            raise
-        except Exception as error:
-            return None, f'the reference: {_reason(error)}'.replace(f'{temporary}/', '')
-    return forces, ''
+    try:
+        done = _compute(bag, bag_hash, Setting(1, json.loads(changes)), watched=False)
+    except UnavailableError as error:
+        raise UnavailableError(f'the reference: {error}') from None
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:
+        return None, f'the reference: {_reason(error)}'
+    return done.run.forces, ''
 
 
 @dataclass(frozen=True)
@@ -262,27 +261,26 @@ class _Session:
     differs: int
 
 
-def _compute(
-    place: str, bag_hash: str, setting: Setting, temporary: Path, *, watched: bool
-) -> _Session:
+def _compute(place: str, bag_hash: str, setting: Setting, *, watched: bool) -> _Session:
     """Compute a session under a setting; its exercise, if that is watched."""
     recording = read_recording(place, bag_hash)
     bag, beginning, felt = recording.bag, recording.beginning, recording.felt
     if setting.mesh is not None:
         require(setting.mesh)
-    scene = load_scene(str(restore_scene(bag, temporary, setting.in_yaml)))
-    changed, differs = setting.number > 0, None
-    attempt = Attempt(scene.exercise) if watched and scene.exercise.title else None
-    refuse_lost_changes(bag, setting.changes)
-    computed = recomputation(scene, beginning, changed=changed)
-    if changed:
-        recorded = recording.records, recording.poses, recording.indexings
-        run = move_hand(*recorded, scene, computed, attempt)
-    else:
-        differs = recompute(recording.records, computed)
-        run = as_felt(felt, computed)
-        if attempt is not None:
-            attempt = read_attempt(bag, scene.exercise, (felt.times, felt.forces))
+    with tempfile.TemporaryDirectory(prefix=_TEMPORARY) as temporary:
+        scene = load_scene(str(restore_scene(bag, Path(temporary), setting.in_yaml)))
+        changed, differs = setting.number > 0, None
+        attempt = Attempt(scene.exercise) if watched and scene.exercise.title else None
+        refuse_lost_changes(bag, setting.changes)
+        computed = recomputation(scene, beginning, changed=changed)
+        if changed:
+            recorded = recording.records, recording.poses, recording.indexings
+            run = move_hand(*recorded, scene, computed, attempt)
+        else:
+            differs = recompute(recording.records, computed)
+            run = as_felt(felt, computed)
+            if attempt is not None:
+                attempt = read_attempt(bag, scene.exercise, (felt.times, felt.forces))
     return _Session(run, computed.simulation, attempt, differs or 0)
 
 
@@ -306,7 +304,7 @@ def read_recording(place: str, expected_hash: str) -> Recording:
 
 def _reason(error: Exception) -> str:
     """Return a sentence about a failure, with its place where the sentence is not ours."""
-    text = without_copies(' '.join(str(error).split()))
+    text = _OWN_FOLDER.sub('', without_copies(' '.join(str(error).split())))
     if isinstance(error, _SENTENCES):
         return text
     place = traceback.extract_tb(error.__traceback__)[-1]

@@ -10,14 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from cutting_trainer.session.errors import SessionError
-from cutting_trainer.studies.designs import Setting
+from cutting_trainer.studies.designs import Key, Setting
 from cutting_trainer.studies.evaluation import Result
 from cutting_trainer.studies.identity import Identity
 
 JOURNAL_FILE = 'rows.jsonl'
-
-Key = tuple[str, str]
-"""Hash of a bag and identity of a setting."""
 
 
 def key_of(bag_hash: str, setting: Setting) -> Key:

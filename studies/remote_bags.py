@@ -17,7 +17,6 @@ from cutting_trainer.bags.metadata import METADATA_FILE
 from cutting_trainer.session.errors import SessionError
 
 _HASH_DIGITS = 16
-_COPY = re.compile(rf'\S*/cutting-trainer/bags/[0-9a-f]{{{_HASH_DIGITS}}}/')
 
 
 class UnavailableError(SessionError):
@@ -56,8 +55,7 @@ def copied_bag(url: str) -> Path:
     with _reaching(url):
         paths = sorted(path for path in files.ls(root, detail=False) if _is_of_bag(path))
         state = '\0'.join([url, *(_state(files.info(path)) for path in paths)])
-    cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
-    copies = cache / 'cutting-trainer' / 'bags'
+    copies = _copies()
     key = hashlib.sha256(state.encode()).hexdigest()[:_HASH_DIGITS]
     copy = copies / key / PurePosixPath(root).name
     names = [PurePosixPath(path).name for path in paths]
@@ -79,7 +77,12 @@ def copied_bag(url: str) -> Path:
 
 def without_copies(text: str) -> str:
     """Return a text without the folders of copies, which are others on each machine."""
-    return _COPY.sub('', text)
+    return re.sub(rf'{re.escape(str(_copies()))}/[0-9a-f]{{{_HASH_DIGITS}}}/', '', text)
+
+
+def _copies() -> Path:
+    cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
+    return cache / 'cutting-trainer' / 'bags'
 
 
 def _state(info: dict[str, Any]) -> str:

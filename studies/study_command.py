@@ -28,10 +28,10 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.studies.bag_collection import StudyBag, find_attempts, find_bags
 from cutting_trainer.studies.description import Study, read_study
-from cutting_trainer.studies.designs import RECORDED, Setting, settings_of
+from cutting_trainer.studies.designs import RECORDED, Key, Setting, settings_of
 from cutting_trainer.studies.evaluation import Job, Result
 from cutting_trainer.studies.identity import identity_of_worker
-from cutting_trainer.studies.journal import Journal, Key, key_of, open_journal
+from cutting_trainer.studies.journal import Journal, key_of, open_journal
 from cutting_trainer.studies.kept_files import are_kept, keep
 from cutting_trainer.studies.summary import PAGE_FILE, StudySummary, as_text, summarise, write_page
 from cutting_trainer.studies.table import COSTS_FILE, TABLE_FILE, Row, write_costs, write_table

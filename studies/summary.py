@@ -131,20 +131,14 @@ def as_text(summary: StudySummary) -> Group:
     """Return a summary for the terminal: effects of keys, or of settings where keys have none."""
     parts: list[Any] = []
     if summary.tradeoffs:
-        beside = Table(box=box.SIMPLE_HEAD)
-        for number, name in enumerate(HEAD[:NARROW]):
-            beside.add_column(
-                escape_markup(name), justify='right' if number else 'left', overflow='fold'
-            )
+        beside = _empty_table(HEAD[:NARROW])
         for one in summary.tradeoffs[:MAX_LINES]:
             beside.add_row(*map(escape_markup, one.cells[:NARROW]))
         parts += [beside, MEANING]
         if len(summary.tradeoffs) > MAX_LINES:
             parts.append('the page has all settings')
     effects = summary.keys or summary.settings
-    shown = Table(box=box.SIMPLE_HEAD)
-    for number, name in enumerate(_HEAD[1:]):
-        shown.add_column(name, justify='right' if number else 'left', overflow='fold')
+    shown = _empty_table(_HEAD[1:])
     output = ''
     for effect in effects[:MAX_LINES]:
         name, *cells = map(escape_markup, _cells(effect))
@@ -158,6 +152,14 @@ def as_text(summary: StudySummary) -> Group:
         parts.append('the page has all effects')
     parts += [escape_markup(sentence) for sentence in _sentences(summary)]
     return Group(*parts)
+
+
+def _empty_table(head: Sequence[str]) -> Table:
+    empty = Table(box=box.SIMPLE_HEAD)
+    for number, name in enumerate(head):
+        justify: Any = 'right' if number else 'left'
+        empty.add_column(escape_markup(name), justify=justify, overflow='fold')
+    return empty
 
 
 def write_page(file: Path, title: str, summary: StudySummary) -> None:

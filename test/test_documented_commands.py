@@ -181,7 +181,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
         'takes a minute, and ten bags: test_studies_on_dask.py computes another study'
     ),
     './trainer study config/studies/models.yaml -o bags/sessions/models': Nowhere(
-        'takes two minutes, and ten bags: test_studies.py computes rows beside another reference'
+        'takes two minutes, and ten bags: test_study_rows.py computes rows beside another reference'
     ),
     './trainer run python -m pip install paramiko': Nowhere('changes the environment'),
     './trainer identify bags/sessions/study -o bags/sessions/identified': Nowhere(
