@@ -1,6 +1,7 @@
 """Dask workers of a study: a cluster of its own, or the scheduler of somebody else."""
 
 import contextlib
+import gc
 import logging
 import os
 import time
@@ -116,13 +117,19 @@ def others_cluster(address: str) -> Iterator[Client]:
         SessionError: there is none, it has no workers, or one has other versions.
     """
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    refused = ''
     try:
         client = Client(address, timeout=10)
     except (OSError, ValueError, RuntimeError, TypeError, ImportError) as error:
+        refused = ' '.join(str(error).split())[:150] or type(error).__name__
+    if refused:
+        # A client closes itself when it is freed, and where that happens while another one starts
+        # it waits for ever: it is freed here.
+        gc.collect()
         raise SessionError(
-            f'--scheduler {address}: no Dask scheduler answers there '
-            f'({" ".join(str(error).split())[:150]}): start one with `./trainer run dask scheduler`'
-        ) from None
+            f'--scheduler {address}: no Dask scheduler answers there ({refused}): start one with '
+            '`./trainer run dask scheduler`'
+        )
     with client:
         try:
             client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)

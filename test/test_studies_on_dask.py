@@ -1,5 +1,6 @@
 """Studies on workers: the same rows, once each, whatever happens to the workers."""
 
+import gc
 import os
 import re
 import shutil
@@ -288,12 +289,19 @@ def test_most_rows_wait_here_and_not_at_the_scheduler(client: Client) -> None:
     computed.close()
 
 
-def test_scheduler_that_does_not_answer_is_named() -> None:
+def test_scheduler_that_does_not_answer_is_named_and_its_client_is_freed_at_once() -> None:
+    # Freed later, by the garbage collector, it could wait for ever for a lock of Dask.
+    before = len(clients())
     with (
-        pytest.raises(SessionError, match=r'--scheduler nothing://there: no Dask scheduler'),
+        pytest.raises(SessionError, match=r'--scheduler nothing://there: no Dask scheduler') as _,
         others_cluster('nothing://there'),
     ):
         pass
+    assert len(clients()) == before
+
+
+def clients() -> list[Client]:
+    return [found for found in gc.get_objects() if isinstance(found, Client)]
 
 
 def test_workers_of_others_are_taken(client: Client) -> None:
