@@ -59,7 +59,9 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
         temporary: folder for the files of all: the last tests look at what all have made.
         tier: the quick one has only tests of the first part.
     """
-    python, by_file = (sys.executable, '-m'), ('--dist=loadfile',)
+    # A process that a test has ended is not replaced: the new one would run that test first, and
+    # so on without an end.
+    python, by_file = (sys.executable, '-m'), ('--dist=loadfile', '--max-worker-restart=0')
     checks = [
         Check('ruff check', (*python, 'ruff', 'check', '.')),
         Check('ruff format', (*python, 'ruff', 'format', '--check', '.')),

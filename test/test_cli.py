@@ -251,6 +251,18 @@ def test_extra_arguments_of_the_test_command_reach_pytest() -> None:
     assert not any(a.startswith('--numprocesses') for a in alone.argv)
 
 
+def test_test_that_ends_its_process_fails_and_the_others_have_an_end(tmp_path: Path) -> None:
+    # A new process ran that test again, and so on: tests that had stopped for ever took CI's time.
+    (tmp_path / 'test_ends.py').write_text('import os\ndef test_ends(): os._exit(1)\n')
+    (tmp_path / 'test_goes_on.py').write_text('def test_goes_on(): pass\n')
+    *_, beside, _, _ = all_checks([], tmp_path, 'usual')
+    argv = [a for a in beside.argv if not a.startswith(('--tier', '--part', '--numprocesses'))]
+    ran = subprocess.run(
+        [*argv, '--numprocesses=2'], cwd=tmp_path, capture_output=True, text=True, timeout=100
+    )
+    assert ran.returncode == 1 and '1 failed, 1 passed' in ran.stdout, ran.stdout
+
+
 def test_the_quick_tier_needs_no_graph() -> None:
     checks = all_checks([], Path('/tmp/x'), 'quick')
     assert [check.name for check in checks] == ['ruff check', 'ruff format', TESTS]
