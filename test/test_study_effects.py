@@ -59,7 +59,7 @@ def test_one_key_has_an_effect_of_its_own() -> None:
     settings = [Setting(1, {'a.b': 1}), Setting(2, {'a.b': 2})]
     rows = made_rows(2, settings, np.array([[0, 5, 8]] * 2))
     found, _ = effects_of_keys(rows, ['largest_force'], 0.95)
-    assert [(effect.cause, effect.mean) for effect in found] == [('b 1 -> 2', 3.0)]
+    assert [(effect.cause, effect.mean) for effect in found] == [('b 1 -> 2', pytest.approx(3.0))]
     rows = made_rows(2, settings[:1], np.array([[0, 5]] * 2))
     assert effects_of_keys(rows, ['largest_force'], 0.95) == ([], '')
 
