@@ -17,7 +17,11 @@ from cutting_trainer.node_common.timing import RECEIVES
 
 Work = Literal['bridge', 'arm', 'messages', 'frames', 'other']
 """Work of a node: the force loop of a bridge or of an emulated arm, the messages of such loops, the
-frames of the tissue, or what may run anywhere."""
+frames of the tissue, or what may run anywhere.
+
+What takes messages to a file may run anywhere, too: on a slow machine two loops, and all of it,
+are more than a processor can do, and messages were lost. Its threads that receive have a place.
+"""
 LOOPS_PER_PROCESSOR = 2
 """Force loops that share a processor."""
 _ADDRESS = '\0cutting_trainer.processors'
@@ -27,8 +31,8 @@ def shared_out(work: Sequence[Work], processors: Sequence[int]) -> dict[Work, se
     """Return the processors by the work that is done on them; {} where they are too few.
 
     Frames get processors of their own. Where too few are left for all loops, the arms are on those
-    of the frames, and the recorder is anywhere: of two tools on two processors, 29 of 600 frames
-    are then missed (median of 9 sessions), and 98 where the kernel places the loops.
+    of the frames, and the recorder receives anywhere: of two tools on two processors, 29 of 600
+    frames are then missed (median of 9 sessions), and 98 where the kernel places the loops.
 
     Args:
         work: of each node.
@@ -54,14 +58,18 @@ def _processors_for(loops: int) -> int:
     return -(-loops // LOOPS_PER_PROCESSOR)
 
 
-def place(pid: int, processors: set[int]) -> None:
-    """Put a process that has only just started on some processors."""
-    with suppress(ProcessLookupError):  # it has just ended
-        os.sched_setaffinity(pid, processors)
+def place(pid: int, work: Work, found: dict[Work, set[int]]) -> None:
+    """Put a process that has only just started on the processors of its work, if it has some."""
+    if work in found and work != 'messages':
+        with suppress(ProcessLookupError):  # it has just ended
+            os.sched_setaffinity(pid, found[work])
 
 
-def place_receivers(pid: int, processors: set[int]) -> None:
-    """Put those threads of a process on some processors in which DDS receives."""
+def place_receivers(pid: int, work: Work, found: dict[Work, set[int]]) -> None:
+    """Put those threads of a process in which DDS receives on the processors of the loops."""
+    if not found or work in ('bridge', 'other'):
+        return
+    processors = found['messages' if work == 'messages' else 'bridge']
     for thread in Path(f'/proc/{pid}/task').glob('*'):
         with suppress(OSError):  # it has just ended
             if (thread / 'comm').read_text().startswith(RECEIVES):

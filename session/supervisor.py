@@ -257,8 +257,7 @@ class Supervisor:
         node = NodeProcess(
             command, self._logs / f'{command.name.replace("/", ".")}.log', self._environment
         )
-        if command.work in self._processors:
-            place(node.process.pid, self._processors[command.work])
+        place(node.process.pid, command.work, self._processors)
         self._nodes[command.name] = node
         self._selector.register(node.pipe, selectors.EVENT_READ, node)
 
@@ -336,8 +335,7 @@ class Supervisor:
             return
         if line == f'ready: {node.name}':
             node.ready, node.beat = True, self._lived
-            if self._processors and node.command.work in ('arm', 'frames'):
-                place_receivers(node.process.pid, self._processors['bridge'])
+            place_receivers(node.process.pid, node.command.work, self._processors)
             self._emit(Event('ready', node.name, line))
         elif line == f'done: {node.name}':
             node.done = True

@@ -16,6 +16,12 @@ from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.processors import Work, reserved_processors, shared_out
 from cutting_trainer.session.supervisor import Supervisor
 
+KINDS: dict[str, Work] = {
+    'arm': 'arm',
+    'tissue': 'frames',
+    'recorder': 'messages',
+    'cutting': 'other',
+}
 SESSION: list[Work] = ['arm', 'bridge', 'frames', 'messages', 'other']
 RECEIVES = """
 import ctypes, sys, threading, time
@@ -110,13 +116,14 @@ def test_nodes_run_on_the_processors_of_their_work(tmp_path: Path) -> None:
     all_of_them = os.sched_getaffinity(0)
     with reserved_processors(SESSION) as reserved:
         expected = dict(reserved)
-    kinds: dict[str, Work] = {'arm': 'arm', 'tissue': 'frames', 'cutting': 'other'}
+    kinds = KINDS
     ledger = Ledger(tmp_path / 'ledger')
     nodes = [replace(command(name, ledger), work=kind) for name, kind in kinds.items()]
     with Supervisor(nodes, tmp_path / 'log', ENVIRONMENT) as supervisor:
         assert supervisor.start()
         for name, pid in supervisor.pids.items():
-            own = expected.get(kinds[name], all_of_them)
+            placed = kinds[name] != 'messages'  # which on a slow machine need more than is left
+            own = expected.get(kinds[name], all_of_them) if placed else all_of_them
             assert os.sched_getaffinity(pid) == own
 
 
@@ -128,7 +135,7 @@ def threads(pid: int) -> dict[str, set[int]]:
 
 @pytest.mark.usefixtures('own_address')
 def test_what_receives_messages_of_force_loops_is_on_their_processor(tmp_path: Path) -> None:
-    kinds: dict[str, Work] = {'arm': 'arm', 'tissue': 'frames', 'cutting': 'other'}
+    kinds = KINDS
     argv = (sys.executable, '-S', '-c', RECEIVES)
     nodes = [NodeCommand(name, (*argv, name), work=kind) for name, kind in kinds.items()]
     everywhere = os.sched_getaffinity(0)
@@ -137,6 +144,7 @@ def test_what_receives_messages_of_force_loops_is_on_their_processor(tmp_path: P
         assert supervisor.start()
         found = {name: threads(pid) for name, pid in supervisor.pids.items()}
     receivers = {name: by_thread.pop('dds.udp.7411') for name, by_thread in found.items()}
-    assert receivers['arm'] == receivers['tissue'] == expected.get('bridge', everywhere)
+    loops = expected.get('bridge', everywhere)
+    assert receivers['arm'] == receivers['tissue'] == receivers['recorder'] == loops
     assert [*found['tissue'].values()] == [expected.get('frames', everywhere)]
-    assert receivers['cutting'] == everywhere
+    assert [*found['recorder'].values()] == [receivers['cutting']] == [everywhere]
