@@ -11,18 +11,10 @@ from numpy.typing import NDArray
 
 from cutting_trainer.cutting.coverage import GAP, uncovered_points
 from cutting_trainer.cutting.front import Opened
+from cutting_trainer.cutting.local_mesh import Local, centres_of, local_elements
 from cutting_trainer.cutting.lookup import MINUS, NODES, PLUS, Tables
-from cutting_trainer.cutting.parting import (
-    Floats,
-    Local,
-    Surface,
-    centres_of,
-    judged_heights,
-    least_faces,
-    local_elements,
-    nearest_points,
-    open_faces,
-)
+from cutting_trainer.cutting.parting import judged_heights, least_faces, open_faces
+from cutting_trainer.cutting.swept_surface import Floats, Surface, nearest_points
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 

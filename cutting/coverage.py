@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cutting_trainer.cutting.front import Opened
-from cutting_trainer.cutting.parting import Floats, Surface
+from cutting_trainer.cutting.swept_surface import Floats, Surface
 from cutting_trainer.node_common.kernels import kernel
 from cutting_trainer.tissue_sim.mesh.locate import distances_to_triangles, find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh

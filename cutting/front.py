@@ -12,14 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cutting_trainer.cutting.geometry import altitude, smallest_altitudes
-from cutting_trainer.cutting.parting import (
-    Floats,
-    Ints,
-    Local,
-    area_of,
-    list_corners,
-    local_elements,
-)
+from cutting_trainer.cutting.local_mesh import Local, area_of, list_corners, local_elements
+from cutting_trainer.cutting.swept_surface import Floats, Ints
 from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.mesh.locate import find_tetrahedra
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta

@@ -7,7 +7,8 @@ swept all of it.
 
 import numpy as np
 
-from cutting_trainer.cutting.parting import Floats, Ints, Surface, nearest_points, part_along
+from cutting_trainer.cutting.parting import part_along
+from cutting_trainer.cutting.swept_surface import Floats, Ints, Surface, nearest_points
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 
 _SPACING = 0.2

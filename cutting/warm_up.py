@@ -6,9 +6,10 @@ import numpy as np
 
 from cutting_trainer.cutting.lookup import edge_key, empty_tables, find_edge, with_room
 from cutting_trainer.cutting.method_registry import make_method
-from cutting_trainer.cutting.parting import Surface, part_along
+from cutting_trainer.cutting.parting import part_along
 from cutting_trainer.cutting.scene_schema import CuttingSettings
 from cutting_trainer.cutting.state_table import block, put_on_cut
+from cutting_trainer.cutting.swept_surface import Surface
 from cutting_trainer.tissue_sim.contact.blade import Sweep
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
 from cutting_trainer.tissue_sim.warm_up import small_cube

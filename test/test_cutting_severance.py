@@ -20,7 +20,7 @@ from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free
 from bench.cuts.strokes import good_block
 from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.cutting.cut_invariants import check_area, check_mesh, cut_face_area
-from cutting_trainer.cutting.parting import local_elements
+from cutting_trainer.cutting.local_mesh import local_elements
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.mesh.topology import CUT
 

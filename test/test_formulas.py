@@ -10,8 +10,8 @@ from scipy.linalg import polar
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from cutting_trainer.cutting.local_mesh import _gather as gather_around
 from cutting_trainer.cutting.lookup import DONE, EDGES
-from cutting_trainer.cutting.parting import _gather as gather_around
 from cutting_trainer.cutting.snapping import PENDING, _can_join
 from cutting_trainer.haptic_bridge.emulated_arm.hand import _tremble
 from cutting_trainer.haptic_bridge.force_kernels import _rotate
