@@ -93,20 +93,13 @@ def _errors(summary: Summary) -> list[str]:
     ]
 
 
-def held_up(summary: Summary, outcome: Outcome, expected: Expected) -> str:
-    """Return which loop had no processor time, where nothing else explains an error; or ''."""
-    if outcome.troubles or outcome.interrupted:
-        return ''
-    return next(iter(_held_up(summary, expected)), '')
-
-
 def _held_up(summary: Summary, expected: Expected) -> list[str]:
     """Return causes of an error: loops that had no processor time."""
     if not _errors(summary):
         return []
     return [
         f'{node.name} did not run for {1e3 * node.longest_period:.0f} ms: the machine is busy, or '
-        'its host takes the processor away; see ./trainer doctor'
+        'its host takes the processor away; see ./trainer doctor, then try again'
         for name, rate in expected.rates.items()
         if rate * MAX_LOOP_PERIOD_S > 1
         and (node := summary.nodes.get(name))

@@ -1,6 +1,5 @@
 """`trainer demo`: run a session, record its bag, print its table and its verdict."""
 
-import itertools
 import json
 import re
 import socket
@@ -17,7 +16,7 @@ from cutting_trainer.bags.errors import BagError
 from cutting_trainer.exercises.attempt_store import SUBJECT
 from cutting_trainer.haptic_bridge.emulated_arm.hand import compile_script
 from cutting_trainer.node_common.share_folder import PACKAGES, is_checkout
-from cutting_trainer.session.acceptance_criteria import Expected, held_up, judge
+from cutting_trainer.session.acceptance_criteria import Expected, judge
 from cutting_trainer.session.attempts import attempt_data
 from cutting_trainer.session.bag_measurements import read_evidence
 from cutting_trainer.session.domain import reserved_domain
@@ -47,8 +46,6 @@ SESSIONS = (PACKAGES if is_checkout() else Path()) / 'bags' / 'sessions'
 MIN_DURATION_S, MAX_DURATION_S = 1.0, 86400.0  # [s]
 MAX_OVERTIME_S = 15.0
 """A session may last so much longer [s] than its script, which waits for the haptic bridge."""
-MAX_REPEATED_S = 120.0
-"""A session up to so long [s] is run once more where its machine has held it up."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +78,6 @@ class DemoOptions:
 def run_demo(options: DemoOptions) -> Status:
     """Run a session and print its result.
 
-    A short one runs once more where its machine has held up the emulated arm or the haptic bridge.
-
     Raises:
         SessionError, SceneError, SettingsError: an option or the scene is not valid.
     """
@@ -95,30 +90,6 @@ def run_demo(options: DemoOptions) -> Status:
     require_frames(scene)
     seconds = script_seconds(scene, options.seconds)
     bag = new_bag(options.bag, scene.name)
-    expected, notes = expectations(scene), session_console()
-
-    def session() -> tuple[Outcome, Summary | None]:
-        outcome = run_nodes(_nodes(options, scene, seconds, bag), seconds, bag, environment, notes)
-        return outcome, read_summary(outcome, bag, notes)
-
-    with reserved_domain(options.domain) as domain:
-        environment = node_environment(domain)
-        outcome, summary = session()
-        why = held_up(summary, outcome, expected) if summary and seconds <= MAX_REPEATED_S else ''
-        if why:
-            aside = _set_aside(bag)
-            notes.print(
-                f'{why}. The haptic bridge has set the force to zero, as it should. That session '
-                f'is in {aside}; it is run once more',
-                highlight=False,
-                markup=False,
-            )
-            outcome, summary = session()
-    return conclude(outcome, summary, bag, expected, as_json=options.as_json)
-
-
-def _nodes(options: DemoOptions, scene: Scene, seconds: float, bag: Path) -> list[NodeCommand]:
-    """Return the nodes of a session."""
     tools = [tool.label for tool in scene.others]
     said = {'subject': options.subject, 'notes': options.notes}
     if scene.exercise.title:
@@ -126,35 +97,17 @@ def _nodes(options: DemoOptions, scene: Scene, seconds: float, bag: Path) -> lis
     nodes = session_nodes(scene.path, bag, options.seed, seconds, tools, said)
     if options.view:
         nodes.insert(0, viewer_command(scene.path, LOCAL, page_port(), session=False))
-    return nodes
+    notes = session_console()
+    with reserved_domain(options.domain) as domain:
+        outcome = run_nodes(nodes, seconds, bag, node_environment(domain), notes)
+    return conclude(outcome, bag, expectations(scene), as_json=options.as_json)
 
 
-def _set_aside(bag: Path) -> Path:
-    """Rename the folder of a bag, and return its new name."""
-    names = (bag.with_name(f'{bag.name}-held-up-{number}') for number in itertools.count(1))
-    return bag.rename(next(name for name in names if not name.exists()))
-
-
-def read_summary(outcome: Outcome, bag: Path, notes: Console) -> Summary | None:
-    """Return the figures of a session; None where it did not run, or its bag cannot be read."""
-    if not outcome.ran:
-        return None
-    try:
-        with notes.status('reading the bag'):
-            return summarise(read_evidence(bag))
-    except BagError as error:
-        notes.print(f'[bold red]no summary:[/] {escape(str(error))}')
-        return None
-
-
-def conclude(
-    outcome: Outcome, summary: Summary | None, bag: Path, expected: Expected, *, as_json: bool
-) -> Status:
+def conclude(outcome: Outcome, bag: Path, expected: Expected, *, as_json: bool) -> Status:
     """Print the result of a session.
 
     Args:
         outcome: outcome of its processes.
-        summary: its figures; None where it has none.
         bag: bag of the session.
         expected: expectations of its scene.
         as_json: print the summary as JSON.
@@ -164,7 +117,11 @@ def conclude(
         notes.print(f'interrupted (exit status {int(Status.INTERRUPTED)})', highlight=False)
     if not outcome.ran:
         return report_failed_start(outcome, bag, notes)
-    if summary is None:
+    try:
+        with notes.status('reading the bag'):
+            summary = summarise(read_evidence(bag))
+    except BagError as error:
+        notes.print(f'[bold red]no summary:[/] {escape(str(error))}')
         return _status(outcome, ['no summary'])
     failures = judge(summary, outcome, expected)
     if as_json:

@@ -9,7 +9,6 @@ from cutting_trainer.session.demo_command import (
     conclude,
     expectations,
     new_bag,
-    read_summary,
     report_failed_start,
     run_nodes,
     script_seconds,
@@ -68,8 +67,7 @@ def run_bridge_side(options: BridgeSide) -> Status:
         network_environment(domain, options.network) as environment,
     ):
         outcome = run_nodes(nodes, seconds, bag, environment, notes, restart=True)
-    summary = read_summary(outcome, bag, notes)
-    return conclude(outcome, summary, bag, expectations(scene), as_json=options.as_json)
+    return conclude(outcome, bag, expectations(scene), as_json=options.as_json)
 
 
 def run_sim_side(

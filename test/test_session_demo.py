@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.node_commands import MODULES
 from cutting_trainer.session.node_process import NodeCommand
-from cutting_trainer.session.summary import NodeSummary, Summary
+from cutting_trainer.session.summary import Summary
 
 FAKE = Path(__file__).with_name('fake_node.py')
 Run = Callable[..., Status]
@@ -56,38 +55,6 @@ def test_session_that_finished_is_a_success_and_every_node_has_its_log(
 ) -> None:
     assert run(emulated_arm='done') == Status.OK
     assert {path.stem for path in (tmp_path / 'bag' / 'log').iterdir()} == set(MODULES)
-
-
-@pytest.mark.parametrize(
-    ('stalls', 'longest', 'status', 'bags'),
-    [(1, 0.025, Status.OK, 2), (2, 0.025, Status.FAILED, 2), (1, 0.015, Status.FAILED, 1)],
-)
-def test_session_that_its_machine_has_held_up_is_run_once_more_and_its_bag_is_kept(
-    run: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    stalls: int,
-    longest: float,
-    status: Status,
-    bags: int,
-) -> None:
-    fine = NodeSummary('haptic_bridge', 1e3, 1e3, 1.0, 1.0, *[1e-3] * 4, 0.0, '', 0, '')
-    silent = replace(fine, longest_period=longest, worst_level=2, message='no pose for 20 ms')
-    good = Summary('bag', True, 5.0, {fine.name: fine}, 1.0, 1.0, 0.0, 0.0, 1, 1, {}, {})
-    held = replace(good, nodes={fine.name: silent}, elements_cut=0)
-    summaries = iter([held] * stalls + [good])
-    monkeypatch.setattr(demo_command, 'read_evidence', lambda folder: None)
-    monkeypatch.setattr(demo_command, 'summarise', lambda evidence: next(summaries))
-    rates = demo_command.Expected({fine.name: 1000.0}, cut=True)
-    monkeypatch.setattr(demo_command, 'expectations', lambda scene: rates)
-    assert run(emulated_arm='done') == status
-    names = sorted(folder.name for folder in tmp_path.glob('bag*'))
-    assert names == ['bag', 'bag-held-up-1'][:bags]
-    said = ' '.join(capsys.readouterr().err.split())
-    assert ('haptic_bridge did not run for 25 ms' in said) == (bags == 2)
-    assert ('it is run once more' in said) == (bags == 2)
-    assert ('not as it should be' in said) == (status is Status.FAILED)
 
 
 @pytest.mark.usefixtures('perfect')
