@@ -59,8 +59,8 @@ def all_checks(pytest_arguments: Sequence[str], temporary: Path, tier: Tier) -> 
         temporary: folder for the files of all: the last tests look at what all have made.
         tier: the quick one has only tests of the first part.
     """
-    # A process that a test has ended is not replaced: the new one would run that test first, and
-    # so on without an end.
+    # A test that ends its process ends its part of the tests. A new process would run that test
+    # first; one that waits for ever would end one process after the other.
     python, by_file = (sys.executable, '-m'), ('--dist=loadfile', '--max-worker-restart=0')
     checks = [
         Check('ruff check', (*python, 'ruff', 'check', '.')),

@@ -30,6 +30,8 @@ _ADDRESS = '\0cutting_trainer.processors'
 def shared_out(work: Sequence[Work], processors: Sequence[int]) -> dict[Work, set[int]]:
     """Return the processors by the work that is done on them; {} where they are too few.
 
+    Those of `messages` are for the threads that receive them.
+
     Frames get processors of their own. Where too few are left for all loops, the arms are on those
     of the frames, and the recorder receives anywhere: of two tools on two processors, 29 of 600
     frames are then missed (median of 9 sessions), and 98 where the kernel places the loops.
@@ -59,7 +61,9 @@ def _processors_for(loops: int) -> int:
 
 
 def place(pid: int, work: Work, found: dict[Work, set[int]]) -> None:
-    """Put a process that has only just started on the processors of its work, if it has some."""
+    """Put a process that has only just started on the processors of its work, if it has some; of
+    `messages`, only the threads that receive have some.
+    """
     if work in found and work != 'messages':
         with suppress(ProcessLookupError):  # it has just ended
             os.sched_setaffinity(pid, found[work])

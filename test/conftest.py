@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -33,6 +34,8 @@ APART = set[str]().union(*PARTS.values())
 LEFT_OUT = {'quick': {'long', 'thorough', *APART}, 'usual': {'thorough'}, 'all': set[str]()}
 """Marks of the tests that a tier leaves out."""
 MODULE_MARKS = re.compile(r'^pytestmark = (\[[^\]]*\]|.*)', re.MULTILINE)
+PROCESS_ENDED = pytest.StashKey[bool]()
+"""Whether a process ended that had tests to run."""
 RUN = 'TRAINER_TEST_RUN'
 """Variable by which the processes that a test starts are known."""
 
@@ -111,8 +114,17 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_testnodedown(node: Any, error: object) -> None:
+    """Note that a process has ended before its time: some tests were not run."""
+    if error:
+        node.config.stash[PROCESS_ENDED] = True
+
+
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail where a process outlives the tests: it takes the machine from those to come."""
+    """Fail where tests did not run, or where a process outlives the tests: it takes the machine
+    from those to come.
+    """
     deadline = time.monotonic() + 5.0
     while (found := started_here()) and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -121,6 +133,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(process, signal.SIGKILL)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+    if session.config.stash.get(PROCESS_ENDED, False):  # tests that failed alone are run again
+        session.exitstatus = pytest.ExitCode.INTERNAL_ERROR
 
 
 def started_here() -> dict[int, str]:
