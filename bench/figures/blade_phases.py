@@ -8,17 +8,18 @@ from cutting_trainer.session.in_process import InProcess, Tissue, make_force_pat
 from cutting_trainer.session.scene_loader import Scene, load_scene
 from cutting_trainer.tissue_sim.assembly import make_simulation
 
-_PHASES = (0, 11, 22)
-"""[ms] by which the frames begin later: thirds of a frame."""
+_LATER = (11, 22)
+"""[ms] by which the frames begin later than those of the recorded session: thirds of a frame."""
 _FRAMES = 100
-"""[ms] of three frames, by which the hand waits in phase 0."""
+"""[ms] of three frames: a hand that waits for them meets frames as they were recorded."""
 
 
 def measure() -> list[Figure]:
     """Return the figures of line 5."""
     scene = load_scene('liver')
-    hand = [pose for _, pose in script_ticks(scene, _session(scene))]
-    runs = [_opened(scene, hand, phase) for phase in _PHASES]
+    recorded = _session(scene)
+    hand = [pose for _, pose in script_ticks(scene, recorded)]
+    runs = [_opened(scene, recorded), *(_opened(scene, _later(scene, hand, by)) for by in _LATER)]
     areas, count = [area for area, _ in runs], len(runs)
     spread = (max(areas) - min(areas)) * count / sum(areas)
     least = min(share for _, lines in runs for share in lines)
@@ -35,10 +36,15 @@ def _session(scene: Scene) -> InProcess:
     return InProcess(make_force_path(scene), tissue, scene.tissue.integration.rate)
 
 
-def _opened(scene: Scene, hand: list[Pose], phase: int) -> tuple[float, list[float]]:
-    """Return the area that a hand opens [m^2], and which share of each planned line."""
+def _later(scene: Scene, hand: list[Pose], by: int) -> InProcess:
+    """Return a session that the same hand has made, with frames that begin some [ms] later."""
     session = _session(scene)
-    for pose in [hand[0]] * (_FRAMES - phase) + hand:
+    for pose in [hand[0]] * (_FRAMES - by) + hand:
         session.tick(*pose)
+    return session
+
+
+def _opened(scene: Scene, session: InProcess) -> tuple[float, list[float]]:
+    """Return the area that a session has opened [m^2], and which share of each planned line."""
     mesh = session.tissue.simulation.mesh
     return cut_face_area(mesh), opened_lines(scene, mesh)
