@@ -11,26 +11,38 @@ import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from cutting_trainer.node_common.timing import RECEIVES
 
 Work = Literal['bridge', 'arm', 'messages', 'frames', 'other']
 """Work of a node: the force loop of a bridge or of an emulated arm, the messages of such loops, the
-frames of the tissue, or what may run anywhere.
-
-What takes messages to a file may run anywhere, too: on a slow machine two loops, and all of it,
-are more than a processor can do, and messages were lost. Its threads that receive have a place.
-"""
+frames of the tissue, or what may run anywhere."""
 LOOPS_PER_PROCESSOR = 2
 """Force loops that share a processor."""
 _ADDRESS = '\0cutting_trainer.processors'
 
 
-def shared_out(work: Sequence[Work], processors: Sequence[int]) -> dict[Work, set[int]]:
-    """Return the processors by the work that is done on them; {} where they are too few.
+class Places(NamedTuple):
+    """Processors by the work of a node; other work may run anywhere.
 
-    Those of `messages` are for the threads that receive them.
+    Messages are written anywhere: on a slow machine two loops, and all of the recorder, are more
+    than a processor can do, and messages were lost.
+
+    Attributes:
+        processes: of all threads.
+        receivers: of those threads in which DDS receives, where they have others.
+    """
+
+    processes: dict[Work, set[int]]
+    receivers: dict[Work, set[int]]
+
+
+ANYWHERE = Places({}, {})
+
+
+def shared_out(work: Sequence[Work], processors: Sequence[int]) -> Places:
+    """Return the processors by work; `ANYWHERE` where they are too few.
 
     Frames get processors of their own. Where too few are left for all loops, the arms are on those
     of the frames, and the recorder receives anywhere: of two tools on two processors, 29 of 600
@@ -44,36 +56,29 @@ def shared_out(work: Sequence[Work], processors: Sequence[int]) -> dict[Work, se
     apart, together = _processors_for(arms + bridges), _processors_for(bridges)
     count = apart if apart < len(processors) else together
     if 'frames' not in work or not 0 < count < len(processors):
-        return {}
+        return ANYWHERE
     frames, loops = set(processors[:-count]), set(processors[-count:])
-    if count < apart and _processors_for(arms) > len(frames):
-        return {}
-    return {
-        'frames': frames,
-        'bridge': loops,
-        'messages': loops if count == apart else set(processors),
-        'arm': loops if count == apart else frames,
-    }
+    crowded = count < apart
+    if crowded and _processors_for(arms) > len(frames):
+        return ANYWHERE
+    return Places(
+        {'frames': frames, 'bridge': loops, 'arm': frames if crowded else loops},
+        {'frames': loops, 'arm': loops, 'messages': set(processors) if crowded else loops},
+    )
 
 
 def _processors_for(loops: int) -> int:
     return -(-loops // LOOPS_PER_PROCESSOR)
 
 
-def place(pid: int, work: Work, found: dict[Work, set[int]]) -> None:
-    """Put a process that has only just started on the processors of its work, if it has some; of
-    `messages`, only the threads that receive have some.
-    """
-    if work in found and work != 'messages':
-        with suppress(ProcessLookupError):  # it has just ended
-            os.sched_setaffinity(pid, found[work])
+def place(pid: int, processors: set[int]) -> None:
+    """Put a process that has only just started on some processors."""
+    with suppress(ProcessLookupError):  # it has just ended
+        os.sched_setaffinity(pid, processors)
 
 
-def place_receivers(pid: int, work: Work, found: dict[Work, set[int]]) -> None:
-    """Put those threads of a process in which DDS receives on the processors of the loops."""
-    if not found or work in ('bridge', 'other'):
-        return
-    processors = found['messages' if work == 'messages' else 'bridge']
+def place_receivers(pid: int, processors: set[int]) -> None:
+    """Put those threads of a process on some processors in which DDS receives."""
     for thread in Path(f'/proc/{pid}/task').glob('*'):
         with suppress(OSError):  # it has just ended
             if (thread / 'comm').read_text().startswith(RECEIVES):
@@ -81,7 +86,7 @@ def place_receivers(pid: int, work: Work, found: dict[Work, set[int]]) -> None:
 
 
 @contextmanager
-def reserved_processors(work: Sequence[Work]) -> Iterator[dict[Work, set[int]]]:
+def reserved_processors(work: Sequence[Work]) -> Iterator[Places]:
     """Share out the processors that this process may use, for one session of this machine.
 
     A second session would be put on the same ones: it gets none, and the kernel places its nodes.
@@ -92,8 +97,8 @@ def reserved_processors(work: Sequence[Work]) -> Iterator[dict[Work, set[int]]]:
     found = shared_out(work, sorted(os.sched_getaffinity(0)))
     with socket.socket(socket.AF_UNIX) as reservation:  # the kernel frees it with the process
         try:
-            if found:
+            if found.processes:
                 reservation.bind(_ADDRESS)
         except OSError:
-            found = {}
+            found = ANYWHERE
         yield found

@@ -20,7 +20,12 @@ from cutting_trainer.session.node_process import (
     unready_sentence,
 )
 from cutting_trainer.session.outcome import Death, Outcome, describe
-from cutting_trainer.session.processors import Work, place, place_receivers, reserved_processors
+from cutting_trainer.session.processors import (
+    ANYWHERE,
+    place,
+    place_receivers,
+    reserved_processors,
+)
 from cutting_trainer.session.restart_backoff import Backoff
 
 STOPPING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -90,7 +95,7 @@ class Supervisor:
         self._commands = commands
         self._logs = log_folder
         self._held = ExitStack()
-        self._processors: dict[Work, set[int]] = {}
+        self._places = ANYWHERE
         self._environment = environment
         self._emit = on_event
         self._nodes: dict[str, NodeProcess] = {}
@@ -108,7 +113,7 @@ class Supervisor:
         self.e_stop.keys.__enter__()
         self._held.enter_context(preferred_group())
         work = [command.work for command in self._commands]
-        self._processors = self._held.enter_context(reserved_processors(work))
+        self._places = self._held.enter_context(reserved_processors(work))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -257,7 +262,8 @@ class Supervisor:
         node = NodeProcess(
             command, self._logs / f'{command.name.replace("/", ".")}.log', self._environment
         )
-        place(node.process.pid, command.work, self._processors)
+        if command.work in self._places.processes:
+            place(node.process.pid, self._places.processes[command.work])
         self._nodes[command.name] = node
         self._selector.register(node.pipe, selectors.EVENT_READ, node)
 
@@ -335,7 +341,8 @@ class Supervisor:
             return
         if line == f'ready: {node.name}':
             node.ready, node.beat = True, self._lived
-            place_receivers(node.process.pid, node.command.work, self._processors)
+            if node.command.work in self._places.receivers:
+                place_receivers(node.process.pid, self._places.receivers[node.command.work])
             self._emit(Event('ready', node.name, line))
         elif line == f'done: {node.name}':
             node.done = True

@@ -13,7 +13,7 @@ from test_supervisor import ENVIRONMENT, Ledger, command
 from cutting_trainer.session import processors
 from cutting_trainer.session.node_commands import session_nodes
 from cutting_trainer.session.node_process import NodeCommand
-from cutting_trainer.session.processors import Work, reserved_processors, shared_out
+from cutting_trainer.session.processors import ANYWHERE, Work, reserved_processors, shared_out
 from cutting_trainer.session.supervisor import Supervisor
 
 KINDS: dict[str, Work] = {
@@ -58,8 +58,9 @@ def own_address(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_force_loops_share_a_processor_and_frames_get_the_others(
     work: list[Work], available: list[int], loops: set[int], frames: set[int]
 ) -> None:
-    expected = {'bridge': loops, 'arm': loops, 'messages': loops, 'frames': frames}
-    assert shared_out(work, available) == expected
+    processes = {'bridge': loops, 'arm': loops, 'frames': frames}
+    receivers = dict.fromkeys(('arm', 'messages', 'frames'), loops)
+    assert shared_out(work, available) == (processes, receivers)
 
 
 @pytest.mark.parametrize(
@@ -69,17 +70,18 @@ def test_arms_go_to_the_frames_where_too_few_processors_are_left(
     tools: int, available: list[int], arms: set[int] | None
 ) -> None:
     found = shared_out(tools * ['arm', 'bridge'] + ['frames'], available)
-    assert found.get('arm') == arms
+    assert found.processes.get('arm') == arms
     if arms is not None:
-        assert found['frames'] == arms and found['bridge'] == set(available) - arms
-        assert found['messages'] == set(available)
+        bridges = set(available) - arms
+        assert found.processes['frames'] == arms and found.processes['bridge'] == bridges
+        assert found.receivers['messages'] == set(available)
 
 
 @given(st.lists(st.sampled_from(SESSION), max_size=9), st.sets(st.integers(0, 63), min_size=1))
 def test_no_processor_has_too_many_loops_and_no_bridge_one_of_frames(
     work: list[Work], available: set[int]
 ) -> None:
-    found = shared_out(work, sorted(available))
+    found = shared_out(work, sorted(available)).processes
     arms, bridges = work.count('arm'), work.count('bridge')
     if not found:
         room = 2 * (len(available) - 1)
@@ -106,7 +108,7 @@ def test_each_node_has_the_work_that_it_does() -> None:
 @pytest.mark.usefixtures('own_address')
 def test_a_second_session_of_the_machine_gets_none() -> None:
     with reserved_processors(SESSION) as first, reserved_processors(SESSION) as second:
-        assert second == {}
+        assert second == ANYWHERE
     with reserved_processors(SESSION) as again:
         assert again == first
 
@@ -115,15 +117,13 @@ def test_a_second_session_of_the_machine_gets_none() -> None:
 def test_nodes_run_on_the_processors_of_their_work(tmp_path: Path) -> None:
     all_of_them = os.sched_getaffinity(0)
     with reserved_processors(SESSION) as reserved:
-        expected = dict(reserved)
-    kinds = KINDS
+        expected = reserved.processes
     ledger = Ledger(tmp_path / 'ledger')
-    nodes = [replace(command(name, ledger), work=kind) for name, kind in kinds.items()]
+    nodes = [replace(command(name, ledger), work=kind) for name, kind in KINDS.items()]
     with Supervisor(nodes, tmp_path / 'log', ENVIRONMENT) as supervisor:
         assert supervisor.start()
         for name, pid in supervisor.pids.items():
-            placed = kinds[name] != 'messages'  # which on a slow machine need more than is left
-            own = expected.get(kinds[name], all_of_them) if placed else all_of_them
+            own = expected.get(KINDS[name], all_of_them)
             assert os.sched_getaffinity(pid) == own
 
 
@@ -135,11 +135,10 @@ def threads(pid: int) -> dict[str, set[int]]:
 
 @pytest.mark.usefixtures('own_address')
 def test_what_receives_messages_of_force_loops_is_on_their_processor(tmp_path: Path) -> None:
-    kinds = KINDS
     argv = (sys.executable, '-S', '-c', RECEIVES)
-    nodes = [NodeCommand(name, (*argv, name), work=kind) for name, kind in kinds.items()]
+    nodes = [NodeCommand(name, (*argv, name), work=kind) for name, kind in KINDS.items()]
     everywhere = os.sched_getaffinity(0)
-    expected = shared_out([*kinds.values()], sorted(everywhere))  # none where there is one
+    expected = shared_out([*KINDS.values()], sorted(everywhere)).processes  # {} of one processor
     with Supervisor(nodes, tmp_path / 'log', ENVIRONMENT) as supervisor:
         assert supervisor.start()
         found = {name: threads(pid) for name, pid in supervisor.pids.items()}

@@ -290,7 +290,8 @@ def test_most_rows_wait_here_and_not_at_the_scheduler(client: Client) -> None:
 
 
 def test_scheduler_that_does_not_answer_is_named_and_its_client_is_freed_at_once() -> None:
-    # Freed later, by the garbage collector, it could wait for ever for a lock of Dask.
+    # Freed later, by the garbage collector, it could wait for ever for a lock of Dask. `_` keeps
+    # the error, and by it the frames in which the client was made.
     gc.collect()
     before = len(clients())
     with (
