@@ -24,6 +24,10 @@ _ROOM_FOR_CHILDREN = 6.0
 _LEAD = 0.44
 """How far a cut is led on where a stroke begins or ends inside the tissue, in median altitudes. The
 front ends short of the blade by so much in the mean."""
+_BRIEF, _MIN_WAY = 0.3, 1.25
+"""How much further a cut is led on at its end, in median altitudes, for each edge of way that a
+stroke is shorter than the second, in edges. A short one passes between the edges of the elements.
+"""
 _REACH, _SHALLOW = 0.25, 1.0
 """How much further than its tip a blade is taken to cut that is an edge deep or deeper; and what is
 added for each edge that is lacking to this depth, in median altitudes. A shallow blade passes
@@ -46,7 +50,7 @@ _HOLDS = 'the tissue holds together across the cut at ({:.1f}, {:.1f}, {:.1f}) m
 _CLOSED = (
     'the tissue still holds together where the blade swept {:.2f} cm^2 around '
     '({:.1f}, {:.1f}, {:.1f}) mm at rest: elements with edges of {:.1f} mm are too large for a cut '
-    'so shallow'
+    'so small'
 )
 FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
 
@@ -178,8 +182,8 @@ class CombinedMethod:
         delta, area, places = part_bridges(mesh, delta, self._tables, self._first_new, lines, h)
         ends = []
         for one in (lines, lines[::-1]):
-            way = np.cumsum(np.linalg.norm(np.diff(one, axis=0), axis=2).mean(axis=1))
-            ends.append(np.ascontiguousarray(one[: 2 + int(np.searchsorted(way, _STRIP * h))]))
+            count = 2 + int(np.searchsorted(_ways(one), _STRIP * h))
+            ends.append(np.ascontiguousarray(one[:count]))
         nodes = self._tables.node_id[: self._tables.counts[NODES]]
         delta, more = part_junctions(mesh, delta, nodes, ends, self._strips, h)
         self._strips = [*self._strips, *ends][-_MAX_STRIPS:]
@@ -200,7 +204,10 @@ class CombinedMethod:
 
     def _round_off(self, mesh: TetMesh, positions: np.ndarray) -> None:
         """Lead the cut on where a stroke ends inside the tissue."""
-        lead = _LEAD * self._altitude if self._scheme.leads_on else 0.0
+        lead = 0.0
+        if self._scheme.leads_on:
+            lacking = _MIN_WAY - _ways(self._lines).max(initial=0.0) / (_EDGE * self._altitude)
+            lead = (_LEAD + _BRIEF * max(lacking, 0.0)) * self._altitude
         way = (self._last[2:] - self._last[1::-1]).mean(axis=0)
         length = float(np.linalg.norm(way))
         if len(self._active) and min(lead, length) > 0.0:
@@ -249,8 +256,11 @@ class CombinedMethod:
         )
         self._located |= len(met) > 0
         active, depth = active_list(corners[3], corners[2], links, tables, positions, met)
-        before, after = self._reach, self._reach_at(depth)
-        back = 0.0 if tables.counts[NODES] or before == 0.0 else _LEAD * self._altitude
+        before, after, back = self._reach, self._reach_at(depth), 0.0
+        if not tables.counts[NODES]:
+            _, begun = active_list(corners[0], corners[1], links, tables, positions, met)
+            before = self._reach_at(begun)
+            back = _LEAD * self._altitude if before > 0.0 else 0.0
         triangles = surfaces(lengthened(corners, before, after, back=back))
         nodes, data = find_hits(triangles, links, tables, positions, met)
         self._turn(triangles, corners)
@@ -316,3 +326,12 @@ class CombinedMethod:
         if pending(self._tables):
             raise CutStateError('crossings are pending after a stroke; they have to be in the mesh')
         clear(self._tables, self._first_new, mesh.node_count + new_nodes)
+
+
+def _ways(lines: np.ndarray) -> np.ndarray:
+    """Return the way from the first of some places of an edge to each later one [m], (k - 1,).
+
+    Args:
+        lines: root and tip by place [m], shape (k, 2, 3).
+    """
+    return np.cumsum(np.linalg.norm(np.diff(lines, axis=0), axis=2).mean(axis=1))

@@ -18,6 +18,9 @@ _NEAR = 0.6
 """Distance from the opened faces up to which a place counts as opened, in edges."""
 _MIN_AREA = 0.5
 """Closed area that matters, in squared edges."""
+_THIN, _SHARES = 0.15, (0.25, 0.5, 0.75, 1.0)
+"""Thickness from which on a shaving counts in full, in edges, and shares of it that are looked at:
+cut faces lie up to as far off the surface."""
 
 
 def uncovered_points(mesh: TetMesh, surface: Surface, opened: Opened, h: float) -> Floats:
@@ -103,7 +106,9 @@ def _covered(points, normals, reach, rest, triangles):
 def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple[float, Floats]:
     """Return the swept area that is not opened [m^2], and its middle [m], shape (3,).
 
-    Less than half a squared edge does not matter, and counts as none.
+    Less than half a squared edge does not matter, and counts as none. Where the blade shaves less
+    than 0.15 edges off a side of the tissue, the area counts by the share of that thickness: a
+    flake of half an element does not matter.
 
     Args:
         mesh: the tissue.
@@ -123,16 +128,34 @@ def closed_area(mesh: TetMesh, lines: Floats, opened: Opened, h: float) -> tuple
     places = (middles[:, :1] + shares * np.diff(middles, axis=1)).reshape(-1, 3)
     ways = along[:, :1] + shares * np.diff(along, axis=1)
     sides = np.repeat(np.diff(middles, axis=1) / count, count, axis=1)
-    areas = np.linalg.norm(np.cross(ways, sides), axis=2).ravel()
+    normals = np.cross(ways, sides).reshape(-1, 3)
+    areas = np.linalg.norm(normals, axis=1)
     found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, places)
     outside = np.linalg.norm(along, axis=2).mean(axis=1) > GAP * h
     inside = (found >= 0) & ~np.repeat(outside, count)
-    places, areas = places[inside], areas[inside]
+    places, areas, normals = places[inside], areas[inside], normals[inside]
     earlier = _cuts_around(mesh, places, _NEAR * h)
     new = opened.triangles.astype(earlier.dtype)
     distance = distances_to_triangles(places, opened.rest, new)
     closed = np.minimum(distance, distances_to_triangles(places, mesh.rest, earlier)) > _NEAR * h
-    area = float(areas[closed].sum())
-    if area < _MIN_AREA * h**2:
+    places, areas, normals = places[closed], areas[closed], normals[closed]
+    across = _THIN * h / areas.clip(1e-300)[:, None] * normals
+    if areas @ _thickness(mesh, places, across) < _MIN_AREA * h**2:
         return 0.0, np.zeros(3)
-    return area, areas[closed] @ places[closed] / area
+    area = float(areas.sum())
+    return area, areas @ places / area
+
+
+def _thickness(mesh: TetMesh, places: Floats, across: Floats) -> Floats:
+    """Return how much of a way across a surface is tissue on both of its sides, from 0 to 1, (p,).
+
+    Args:
+        mesh: the tissue.
+        places: in the rest shape [m], shape (p, 3).
+        across: the ways [m], shape (p, 3).
+    """
+    shares = np.array([*_SHARES, *(-share for share in _SHARES)])[:, None, None]
+    around = (places + shares * across).reshape(-1, 3)
+    found, _ = find_tetrahedra(mesh.rest, mesh.tetrahedra, mesh.neighbors, around)
+    both = (found >= 0).reshape(2, len(_SHARES), len(places)).all(axis=0)
+    return both.mean(axis=0)

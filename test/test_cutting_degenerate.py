@@ -87,7 +87,7 @@ def test_a_face_cut_within_its_border_stays_closed_and_valid():
 def test_the_front_has_one_node_for_each_face_that_it_ends_in():
     nodes = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * H
     mesh = mesh_of(nodes, np.array([[0, 1, 2, 3]]))
-    path = straight((0.5 * H, -0.5 * H, 0.2 * H), (0.5 * H, 0.2 * H, 0.2 * H), (0, 0, -H), 3)
+    path = straight((0.5 * H, -0.5 * H, 0.2 * H), (0.5 * H, 0.02 * H, 0.2 * H), (0, 0, -H), 3)
     assert named(draw(method_named(), mesh, path))['C'] == 1
     assert mesh.node_count == 4 + 2 + 2
     assert len(mesh.tetrahedra) == 6

@@ -175,6 +175,45 @@ def test_the_opened_area_is_the_swept_one(depth):
     assert opened / swept == pytest.approx(1.0, abs=0.08)
 
 
+@pytest.mark.parametrize(('length', 'least'), [(1.0, 0.85), (1.5, 0.94)])
+def test_a_stroke_of_an_edge_opens_what_it_sweeps_in_the_mean(length, least):
+    """It begins and ends inside the tissue: both its ends lie between the edges of the elements."""
+    block, opened = organ_of('block', *good_block((7, 7, 4), 0.005, seed=31)), []
+    for k in range(24):
+        rng = np.random.default_rng(400 + k)
+        angle, start = rng.uniform(0, 2 * np.pi), rng.uniform(-1, 1, 2) * block.h
+        way = np.linspace(-0.5, 0.5, 13)[:, None] * length * block.h
+        line = block.middle[:2] + start + way * [np.cos(angle), np.sin(angle)]
+        path = np.repeat(np.column_stack([line, np.zeros(13)])[:, None], 2, axis=1)
+        path[:, 0, 2], path[:, 1, 2] = 0.023, -0.003
+        mesh, _, error = cut_mesh(block, Cut((path,)))
+        assert error == ''
+        opened.append(cut_face_area(mesh) / (length * block.h * 0.02))
+    assert least < np.mean(opened) < 1.1
+
+
+@pytest.mark.parametrize(
+    ('thickness', 'length', 'cut', 'said'),
+    [
+        (0.05, 0.5, False, False),
+        (0.05, 4.0, False, True),
+        (0.12, 4.0, False, True),
+        (0.2, 4.0, True, False),
+    ],
+)
+def test_a_shaving_is_cut_or_said_or_smaller_than_an_element(thickness, length, cut, said):
+    block = organ_of('block', *good_block((8, 8, 4), 0.005, seed=31))
+    way = np.linspace(-0.5, 0.5, 41) * length * block.h + block.middle[1]
+    for sign in (1, -1):
+        line = np.column_stack([np.full(41, thickness * block.h), way[::sign]])
+        path = np.repeat(np.column_stack([line, np.zeros(41)])[:, None], 2, axis=1)
+        path[:, 0, 2], path[:, 1, 2] = 0.023, -0.003
+        mesh, warnings, error = cut_mesh(block, Cut((path,)))
+        assert error == ''
+        assert any('so small' in warning for warning in warnings) == said
+        assert (cut_face_area(mesh) > 0.8 * length * block.h * 0.02) == cut
+
+
 def test_the_same_strokes_cut_the_same_mesh(plate):
     cut = curved(plate, 'loop', np.random.default_rng(5))
     one, two = (cut_mesh(plate, cut)[0] for _ in range(2))
@@ -232,7 +271,7 @@ def test_a_swept_area_that_stays_closed_is_said_and_nothing_else_is():
             cut, _ = straight(block, depth, angle)
             mesh, warnings, _ = cut_mesh(block, cut)
             share = opened_share(block, mesh, depth, angle)
-            said = any('so shallow' in warning for warning in warnings)
+            said = any('so small' in warning for warning in warnings)
             assert said or share > 0.6
             assert not said or share < 0.8
             closed += said
