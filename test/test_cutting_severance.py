@@ -175,6 +175,13 @@ def test_the_opened_area_is_the_swept_one(depth):
     assert opened / swept == pytest.approx(1.0, abs=0.08)
 
 
+def through(line: np.ndarray) -> Cut:
+    """Stroke along a line [m], shape (k, 2), of a blade that stands through a block of 20 mm."""
+    path = np.repeat(np.column_stack([line, np.zeros(len(line))])[:, None], 2, axis=1)
+    path[:, 0, 2], path[:, 1, 2] = 0.023, -0.003
+    return Cut((path,))
+
+
 @pytest.mark.parametrize(('length', 'least'), [(1.0, 0.85), (1.5, 0.94)])
 def test_a_stroke_of_an_edge_opens_what_it_sweeps_in_the_mean(length, least):
     """It begins and ends inside the tissue: both its ends lie between the edges of the elements."""
@@ -184,9 +191,7 @@ def test_a_stroke_of_an_edge_opens_what_it_sweeps_in_the_mean(length, least):
         angle, start = rng.uniform(0, 2 * np.pi), rng.uniform(-1, 1, 2) * block.h
         way = np.linspace(-0.5, 0.5, 13)[:, None] * length * block.h
         line = block.middle[:2] + start + way * [np.cos(angle), np.sin(angle)]
-        path = np.repeat(np.column_stack([line, np.zeros(13)])[:, None], 2, axis=1)
-        path[:, 0, 2], path[:, 1, 2] = 0.023, -0.003
-        mesh, _, error = cut_mesh(block, Cut((path,)))
+        mesh, _, error = cut_mesh(block, through(line))
         assert error == ''
         opened.append(cut_face_area(mesh) / (length * block.h * 0.02))
     assert least < np.mean(opened) < 1.1
@@ -206,9 +211,7 @@ def test_a_shaving_is_cut_or_said_or_smaller_than_an_element(thickness, length, 
     way = np.linspace(-0.5, 0.5, 41) * length * block.h + block.middle[1]
     for sign in (1, -1):
         line = np.column_stack([np.full(41, thickness * block.h), way[::sign]])
-        path = np.repeat(np.column_stack([line, np.zeros(41)])[:, None], 2, axis=1)
-        path[:, 0, 2], path[:, 1, 2] = 0.023, -0.003
-        mesh, warnings, error = cut_mesh(block, Cut((path,)))
+        mesh, warnings, error = cut_mesh(block, through(line))
         assert error == ''
         assert any('so small' in warning for warning in warnings) == said
         assert (cut_face_area(mesh) > 0.8 * length * block.h * 0.02) == cut
