@@ -76,6 +76,7 @@ class FrameRecord:
         others: contacts of the further tools, by number; None where the bag lacks their inputs.
         indexing: as of a `ToolRecord`, of the first tool.
         concession: see `Frame`.
+        answered: stamp of the last device pose recorded before `force` [ns]; 0: not known.
     """
 
     step: int
@@ -91,6 +92,7 @@ class FrameRecord:
     others: tuple[ToolRecord | None, ...] = ()
     indexing: Indexing | None = None
     concession: int = 0
+    answered: int = 0
 
     @property
     def by_tool(self) -> tuple[ToolRecord | None, ...]:

@@ -17,14 +17,10 @@ from cutting_trainer.bags.reader import Bag, open_bag
 from cutting_trainer.bags.resimulation import answer_frames, as_recorded
 from cutting_trainer.bags.resimulation_start import computable_frames
 from cutting_trainer.cutting.warm_up import warm_up as warm_up_cutting
+from cutting_trainer.recordings.recorded_hand import computable_poses, times_of_frame
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation, refuse_lost_changes
-from cutting_trainer.recordings.what_if import (
-    Hand,
-    closed_loop,
-    computable_poses,
-    time_of_contact,
-)
+from cutting_trainer.recordings.what_if import Hand, closed_loop
 from cutting_trainer.session.exit_status import Status
 from cutting_trainer.session.in_process import make_force_path
 from cutting_trainer.session.scene_loader import Scene
@@ -128,9 +124,9 @@ def resimulated(bag: Bag, scene: Scene, notes: Console, *, changed: bool) -> Com
     if changed:
         records, poses = computable_poses(bag)
         hand = Hand(make_force_path(scene))
-        untils = [time_of_contact(record) for record in records]
+        times = [times_of_frame(record) for record in records]
         computed.answer_frames = answer_frames(records)
-        frames: Iterator[Frame] = (frame for frame, _ in closed_loop(poses, untils, hand, computed))
+        frames: Iterator[Frame] = (frame for frame, _ in closed_loop(poses, times, hand, computed))
     else:
         frames = as_recorded(records, computed)
     with Progress(console=notes, transient=True) as progress:

@@ -1,15 +1,15 @@
 """A recorded hand on a changed tissue: the poses are recorded, all else is recomputed.
 
 Proxy, tissue and cutting run together without ROS. Each recorded pose is a tick of the force loop,
-and each frame of the tissue comes at the same pose as in the session. A cut is answered after as
-many frames as in the session. The hand does not yield to the force: it follows the recorded path.
-The result is compared with the recorded session, of which only the tissue is recomputed.
+and each frame of the tissue comes at the same pose as in the session, as does its answer. A cut is
+answered after as many frames as in the session. The hand does not yield to the force: it follows
+the recorded path. The result is compared with the recorded session, of which only the tissue is
+recomputed.
 """
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from rich import box
@@ -18,11 +18,9 @@ from rich.table import Table
 
 from cutting_trainer.bags.comparison import MAX_ROUNDING
 from cutting_trainer.bags.reader import Bag
-from cutting_trainer.bags.recorded_frames import FrameRecord, contact_message, read_run
+from cutting_trainer.bags.recorded_frames import FrameRecord, contact_message
 from cutting_trainer.bags.recorded_indexings import recorded_indexings
 from cutting_trainer.bags.resimulation import Resimulation, answer_frames, as_recorded
-from cutting_trainer.bags.resimulation_start import find_beginning
-from cutting_trainer.bags.topic_names import CONTACT, POSE, SERVO_CF, of_session
 from cutting_trainer.exercises.bag_feed import add_samples, motion_of
 from cutting_trainer.exercises.metrics import Attempt
 from cutting_trainer.haptic_bridge.force_kernels import NONE
@@ -30,20 +28,23 @@ from cutting_trainer.haptic_bridge.force_path import ForcePath
 from cutting_trainer.haptic_bridge.indexing import Indexing
 from cutting_trainer.haptic_bridge.proxy.surface import Surface
 from cutting_trainer.node_common.cdr_codec import (
-    ContactCodec,
     ForceSampleCodec,
-    PoseStampedCodec,
     StampedMessage,
     WrenchStampedCodec,
 )
 from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.recordings.recorded_hand import (
+    RecordedForce,
+    computable_poses,
+    recorded_force,
+    times_of_frame,
+)
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.in_process import make_force_path
 from cutting_trainer.session.scene_loader import Scene
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
 from cutting_trainer.tissue_sim.contact.tool import Frame, ToolContact, ToolMode
 
-_FRAME_NS, _TICK_NS = 33_333_333, 1_000_000
 _NANOSECOND_S = 1e-9
 
 
@@ -172,13 +173,18 @@ class Hand:
                 self.path.coupling.change(motion_scale=self.indexing.scale)
             self.path.coupling.change(clutched=self.indexing.clutched)
 
-    def follow(self, record: FrameRecord) -> int:
-        """Change the tool as it was changed before a frame; return `time_of_contact`."""
+    def follow(self, record: FrameRecord) -> tuple[int, int]:
+        """Change the tool as it was changed before a frame; return `times_of_frame`."""
         if record.contact is not None:
             if self.mode is not None and record.contact.mode != self.mode:
                 self.path.next_mode = ToolMode(record.contact.mode)
             self.mode = record.contact.mode
-        return time_of_contact(record)
+        return times_of_frame(record)
+
+    def move(self, coming: deque[StampedMessage], until: int) -> None:
+        """Tick with each of the poses to come up to a stamp [ns]."""
+        while coming and coming[0].stamp_ns <= until:
+            self.tick(coming.popleft())
 
     def tick(self, pose: StampedMessage) -> None:
         now = pose.stamp_ns
@@ -194,23 +200,6 @@ class Hand:
             self.motion.append((tick.contact_stamp_ns, motion_of(self.contact.values)))
         force = tick.wrench[WrenchStampedCodec.fields['force']]
         self.ticks.append((now, self.path.force_norm, self.path.contact != NONE, force))
-
-
-@dataclass(frozen=True)
-class RecordedForce:
-    """Force on the hand in answer to each pose.
-
-    Attributes:
-        times: stamps of the poses [ns], shape (n,).
-        forces: norm of the force on the hand [N], shape (n,).
-        contact: contact flag, shape (n,).
-        vectors: force on the hand in the frame of the device [N], shape (n, 3).
-    """
-
-    times: np.ndarray
-    forces: np.ndarray
-    contact: np.ndarray
-    vectors: np.ndarray
 
 
 def run_experiment(bag: Bag, scene: Scene, computed: Resimulation) -> Run:
@@ -247,10 +236,10 @@ def move_hand(
     """
     motion: list[tuple[int, list[float]]] | None = None if attempt is None else []
     hand = Hand(make_force_path(scene), indexings=deque(indexings), motion=motion)
-    untils = (hand.follow(record) for record in records)
+    times_of_frames = (hand.follow(record) for record in records)
     computed.answer_frames = answer_frames(records)
     topology = -1
-    for _ in closed_loop(poses, untils, hand, computed):
+    for _ in closed_loop(poses, times_of_frames, hand, computed):
         mesh = computed.simulation.mesh
         if attempt is not None and mesh.topology != topology:
             topology = mesh.topology
@@ -309,19 +298,6 @@ def as_felt(felt: RecordedForce, computed: Resimulation) -> Run:
     return _run(felt, computed)
 
 
-def recorded_force(bag: Bag, poses: Sequence[StampedMessage]) -> RecordedForce:
-    """Return the recorded force on the hand in answer to its poses.
-
-    Raises:
-        SessionError: the bag has no forces of the hand, or no contacts.
-    """
-    state, force = ContactCodec.fields['state'], WrenchStampedCodec.fields['force']
-    times = np.array([pose.stamp_ns for pose in poses])
-    touched = _at(bag, CONTACT, ContactCodec(), times)[:, state].ravel() != NONE
-    vectors = _at(bag, SERVO_CF, WrenchStampedCodec(), times)[:, force]
-    return RecordedForce(times, np.linalg.norm(vectors, axis=1), touched, vectors)
-
-
 def _run(felt: RecordedForce, computed: Resimulation) -> Run:
     return Run(
         times=(felt.times - felt.times[0]) * _NANOSECOND_S,
@@ -336,78 +312,32 @@ def _run(felt: RecordedForce, computed: Resimulation) -> Run:
     )
 
 
-def computable_poses(bag: Bag) -> tuple[list[FrameRecord], list[StampedMessage]]:
-    """Return the computable frames of a session, and the poses of the device during them.
-
-    Raises:
-        BagError: no frame can be computed; the message has the reason.
-        SessionError: the bag has no poses.
-    """
-    beginning = find_beginning(bag)
-    every, _ = read_run(bag, beginning.segment.run)
-    records, after = beginning.frames(every), 0
-    if beginning.tissue is not None:
-        before = [record for record in every if record.step < beginning.step]
-        # A tissue that is not computed has answered the poses of the frame before.
-        first = time_of_contact(records[0])
-        after = time_of_contact(before[-1]) if before else first - _FRAME_NS
-    until = max((time_of_contact(record) for record in records), default=0)
-    codec, topic = PoseStampedCodec(), of_session(POSE, bag.topics())
-    decoded = (
-        codec.decode(recorded.data)
-        for recorded in bag.messages([topic])
-        if recorded.log_time >= beginning.segment.since
-    )
-    if any(record.others for record in records):
-        raise SessionError(
-            f'{bag.path} has several tools: their hands cannot be moved anew in a changed scene; '
-            'resimulate it without --with'
-        )
-    poses = [pose for pose in decoded if after < pose.stamp_ns <= until]
-    if not poses:
-        raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
-    return records, poses
-
-
-def _at(bag: Bag, topic: str, codec: Any, times: np.ndarray) -> np.ndarray:
-    """Return the values of a 1 kHz stream in answer to poses at times [ns], shape (n, values)."""
-    topic = of_session(topic, bag.topics())
-    samples = [codec.decode(recorded.data) for recorded in bag.messages([topic])]
-    if not samples:
-        raise SessionError(f'{bag.path} has no message of {topic}: --with compares with it')
-    stamps = np.array([sample.stamp_ns for sample in samples])
-    newest = np.searchsorted(stamps, np.append(times[1:], times[-1] + _TICK_NS)) - 1
-    return np.array([sample.values for sample in samples])[np.maximum(newest, 0)]
-
-
 def closed_loop(
-    poses: Sequence[StampedMessage], untils: Iterable[int], hand: Hand, computed: Resimulation
+    poses: Sequence[StampedMessage],
+    times: Iterable[tuple[int, int]],
+    hand: Hand,
+    computed: Resimulation,
 ) -> Iterator[tuple[Frame, int]]:
     """Tick the force loop with each pose, and compute each frame at its time.
 
     Args:
         poses: poses of the device, in order.
-        untils: for each frame, stamp [ns] of the last pose before it.
+        times: for each frame, stamps [ns] of the last poses before it, and before its answer.
         hand: hand before its first tick.
         computed: recomputation before its first frame.
 
     Yields:
         Each frame, and the result of the cut requested before it (see `FrameInputs.answer`).
     """
-    next_pose = 0
-    for until in untils:
-        while next_pose < len(poses) and poses[next_pose].stamp_ns <= until:
-            hand.tick(poses[next_pose])
-            next_pose += 1
+    coming = deque(poses)
+    for begin, end in times:
+        hand.move(coming, begin)
         answer = computed.answer()
         frame = computed.frame(_contact(computed, hand))
-        _show(computed, hand, frame)
+        seen = _seen(computed, hand, frame)
+        hand.move(coming, end)
+        hand.sample, hand.surface = seen
         yield frame, answer
-
-
-def time_of_contact(record: FrameRecord) -> int:
-    """Return the stamp [ns] of the last pose before a frame."""
-    return record.pose.stamp_ns if record.pose is not None else record.time - _FRAME_NS
 
 
 def _contact(computed: Resimulation, hand: Hand) -> ToolContact | None:
@@ -416,18 +346,18 @@ def _contact(computed: Resimulation, hand: Hand) -> ToolContact | None:
     return tool_contact(contact_message(hand.contact), computed.simulation.mesh)
 
 
-def _show(computed: Resimulation, hand: Hand, frame: Frame) -> None:
-    """Pass force sample and surface of a frame to the force loop."""
+def _seen(computed: Resimulation, hand: Hand, frame: Frame) -> tuple[StampedMessage, Surface]:
+    """Return force sample and surface of a frame, as the force loop takes them."""
     simulation = computed.simulation
     sequence = 0 if hand.contact is None else int(hand.contact.values[0])
     stamp = 0 if hand.contact is None else hand.contact.stamp_ns
     head = (frame.step, frame.step, simulation.mesh.topology, sequence)
     values = (*head, *divmod(stamp, 1_000_000_000), *frame.felt)
-    hand.sample = StampedMessage(max(stamp, 1), '', values)
-    hand.surface = Surface(
+    surface = Surface(
         simulation.positions,
         simulation.mesh.triangles,
         revision=frame.step,
         topology=simulation.mesh.topology,
         previous=hand.surface,
     )
+    return StampedMessage(max(stamp, 1), '', values), surface

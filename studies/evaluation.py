@@ -32,17 +32,10 @@ from cutting_trainer.haptic_bridge.scene_schema import (
 from cutting_trainer.haptic_bridge.warm_up import warm_up as warm_up_force_path
 from cutting_trainer.node_common.cdr_codec import StampedMessage
 from cutting_trainer.node_common.errors import MeshError, SceneError
+from cutting_trainer.recordings.recorded_hand import RecordedForce, computable_poses, recorded_force
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation, refuse_lost_changes
-from cutting_trainer.recordings.what_if import (
-    RecordedForce,
-    Run,
-    as_felt,
-    computable_poses,
-    move_hand,
-    recompute,
-    recorded_force,
-)
+from cutting_trainer.recordings.what_if import Run, as_felt, move_hand, recompute
 from cutting_trainer.session.errors import SessionError
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.studies.bag_collection import folder_of, hash_of_bag, require

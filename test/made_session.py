@@ -148,13 +148,13 @@ def make_session(
     cut_step = 0
     untils = range(start + PERIOD, end, PERIOD)
 
-    def begins() -> Iterator[int]:
+    def times() -> Iterator[tuple[int, int]]:
         for number, until in enumerate(untils):
             hand.path.next_mode = (modes or {}).get(number, hand.path.next_mode)
-            yield until
+            yield until, until
 
     for until, (frame, answer) in zip(
-        untils, closed_loop(poses, begins(), hand, computed), strict=True
+        untils, closed_loop(poses, times(), hand, computed), strict=True
     ):
         assert hand.contact is not None
         contact, time = hand.contact, until + 1

@@ -85,8 +85,9 @@ def played(scene: Scene) -> tuple[dict[int, Moment], dict[int, tuple[ObjectState
     hand = Hand(ForcePath(scene.tool, scene.device, scene.haptics, scene.profile))
     computed = watched(scene, EVERY)
     untils = range(poses[0].stamp_ns + PERIOD, poses[-1].stamp_ns, PERIOD)
+    times = ((until, until) for until in untils)
     moments = {}
-    for frame, _ in closed_loop(poses, untils, hand, computed):
+    for frame, _ in closed_loop(poses, times, hand, computed):
         moments[frame.step] = Moment(hand.contact, frame, bits_of(computed, frame))
     return moments, computed.kept
 
@@ -241,7 +242,7 @@ def test_both_sides_of_the_table_begin_after_the_frame_before_the_state(
     assert stamps[0] <= before.stamp_ns
     within = [s for s in stamps if before.stamp_ns < s <= records[-1].pose.stamp_ns]
     monkeypatch.setattr(
-        'cutting_trainer.recordings.what_if._at',
+        'cutting_trainer.recordings.recorded_hand._at',
         lambda bag, topic, codec, times: np.ones((len(times), 99)),
     )
     recorded, differs = recorded_run(bag, recomputation(scene, beginning))

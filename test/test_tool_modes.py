@@ -13,9 +13,10 @@ from cutting_trainer.bags.resimulation import as_recorded
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.node_common.cdr_codec import ContactCodec, ForceSampleCodec
 from cutting_trainer.node_common.operating_state import CrtkState
+from cutting_trainer.recordings.recorded_hand import computable_poses
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation
-from cutting_trainer.recordings.what_if import computable_poses, run_experiment
+from cutting_trainer.recordings.what_if import run_experiment
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.tissue_sim.contact.tool import ToolMode
 

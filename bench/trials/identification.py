@@ -34,9 +34,10 @@ from cutting_trainer.node_common.cdr_codec import (
     StampedMessage,
     WrenchStampedCodec,
 )
+from cutting_trainer.recordings.recorded_hand import computable_poses
 from cutting_trainer.recordings.recorded_scene import restore_scene
 from cutting_trainer.recordings.resimulate_command import recomputation
-from cutting_trainer.recordings.what_if import computable_poses, move_hand
+from cutting_trainer.recordings.what_if import move_hand
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.studies.bag_collection import find_bags
 from cutting_trainer.studies.cluster import own_cluster
