@@ -43,6 +43,8 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 
 _CASE_OF_STATE = np.array([CASES.index(name) for name in NAMES])
 _PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+_SMALL_SHARE = 0.25
+"""Smallest share of an edge between a new node and an end, where elements would be too flat."""
 
 
 class CutStateError(ValueError):
@@ -129,7 +131,7 @@ def build_batch(
     if not len(edges) and not len(nodes):
         size = (mesh.node_count, len(mesh.tetrahedra))
         return Batch(tables, TopologyDelta(), CutReport(), size)
-    _place(tables, edges, scheme)
+    _pull(tables, edges, scheme.least_share if scheme.true_points else 0.5)
     members = ring_members(links, tables, edges)
     m = len(mesh.tetrahedra)
     tables = with_room(
@@ -142,13 +144,6 @@ def build_batch(
     return _assemble(mesh, positions, tables, edges, nodes, parents, pieces, moves, worst)
 
 
-def _place(tables: Tables, edges: np.ndarray, scheme: Scheme) -> None:
-    """Place the new nodes of edges at their crossings, or at midpoints."""
-    share = tables.edge_share[edges]
-    least = scheme.least_share
-    tables.edge_share[edges] = np.clip(share, least, 1 - least) if scheme.true_points else 0.5
-
-
 def _sound_pieces(
     mesh: TetMesh,
     positions: np.ndarray,
@@ -158,15 +153,17 @@ def _sound_pieces(
     scheme: Scheme,
     limits: SnapLimits,
 ) -> tuple[Pieces, _Moves, float, np.ndarray, np.ndarray]:
-    """Divide the parents; below the altitude floor at midpoints, then at nodes, and otherwise not
-    at all. Return also the nodes on the cut, and the parents.
+    """Divide the parents; below the altitude floor with new nodes farther from the ends of edges,
+    then at midpoints, then at nodes, and otherwise not at all. Return also the nodes on the cut,
+    and the parents.
     """
     parents = parents_concerned(mesh.links, tables, edges, nodes)
     front = scheme.tau if scheme.true_points else 0.5
     plain = np.zeros(0, np.int64)
     sliding = nodes if scheme.slides else nodes[:0]
     moves = _Moves(*slides(sliding, mesh.links, tables, mesh.rest, mesh.fixed, limits))
-    for attempt in range(len(edges) + 2):
+    softened = False
+    for attempt in range(len(edges) + 3):
         pieces, unknown = subdivide(parents, mesh.links, tables, positions, mesh.rest, front, plain)
         if unknown >= 0:
             raise CutStateError(
@@ -176,8 +173,13 @@ def _sound_pieces(
         bad, worst = spoiled(pieces, tables, mesh.rest, moves.rows, moves.where, limits.floor)
         if len(bad) == 0:
             break
-        if attempt == 0:
-            plain = _soften(tables, bad, edges)
+        cut = _cut_edges(tables, bad)
+        if attempt == 0 and _pull(tables, np.intersect1d(cut, edges), _SMALL_SHARE):
+            continue
+        if not softened:
+            softened = True
+            plain = np.array([edge_key(*tables.edge_nodes[row].tolist()) for row in cut], np.int64)
+            _pull(tables, np.intersect1d(cut, edges), 0.5)
             stay = np.isin(tables.node_id[sliding], tables.parent_nodes[bad])
             rows = np.ascontiguousarray(sliding[~stay])
             moves = _Moves(*slides(rows, mesh.links, tables, mesh.rest, mesh.fixed, limits))
@@ -193,17 +195,20 @@ def _sound_pieces(
     return pieces, moves, float(worst), nodes, parents
 
 
-def _soften(tables: Tables, bad: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Use midpoints and centroids in some parents."""
-    keys = []
-    for base in tables.parent_nodes[bad].tolist():
-        for i, j in _PAIRS:
-            row = find_edge(tables, base[i], base[j])
-            if row >= 0 and tables.edge_state[row] == DONE:
-                keys.append(edge_key(base[i], base[j]))
-                if row in edges:
-                    tables.edge_share[row] = 0.5
-    return np.array(keys, np.int64)
+def _cut_edges(tables: Tables, parents: np.ndarray) -> np.ndarray:
+    """Return the rows of the edges of some parents that are cut."""
+    rows = []
+    for base in tables.parent_nodes[parents].tolist():
+        found = (find_edge(tables, base[i], base[j]) for i, j in _PAIRS)
+        rows += [row for row in found if row >= 0 and tables.edge_state[row] == DONE]
+    return np.array(rows, np.int64)
+
+
+def _pull(tables: Tables, edges: np.ndarray, least: float) -> bool:
+    """Put new nodes no nearer to an end than a share of their edge; return whether any moved."""
+    before = tables.edge_share[edges]
+    tables.edge_share[edges] = np.clip(before, least, 1.0 - least)
+    return bool((tables.edge_share[edges] != before).any())
 
 
 def _assemble(

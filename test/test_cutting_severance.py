@@ -16,7 +16,7 @@ from bench.cuts.curves import (
     scattered,
     slab,
 )
-from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free
+from bench.cuts.severance import bridges_of, cut_mesh, measure, plug_is_free, random_curve
 from bench.cuts.strokes import good_block
 from cutting_trainer.cutting.combined import FOLDED
 from cutting_trainer.cutting.cut_invariants import check_area, check_mesh, cut_face_area
@@ -57,6 +57,15 @@ def test_a_curved_stroke_leaves_no_bridge(plate, shape):
         run = measure(plate, curved(plate, shape, np.random.default_rng(seed)))
         assert run.error == ''
         assert run.faces == 0 or run.said
+
+
+@pytest.mark.parametrize('seed', [31709, 32479])
+def test_new_nodes_that_would_make_flat_elements_stay_near_the_surface(seed):
+    """At the middle of their edge, they were 0.31 and 0.22 edges off in these curves."""
+    organ = slab((9, 9, 4))
+    run = measure(organ, random_curve(organ, seed))
+    assert run.error == '' and run.faces == 0
+    assert run.distances.max() < 0.15
 
 
 def test_a_bridge_is_found_where_one_is(plate):

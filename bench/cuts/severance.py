@@ -318,12 +318,17 @@ def fuzz(organ: Organ, count: int, seed: int, kept: Path) -> dict[str, float]:
     }
 
 
-def _random_stroke(organ: Organ, seed: int) -> dict[str, Any]:
+def random_curve(organ: Organ, seed: int) -> Cut:
+    """Return a curve of a random shape and depth."""
     rng = np.random.default_rng(seed)
     shape = str(rng.choice(list(SHAPES)))
-    run = measure(organ, curved(organ, shape, rng, through=bool(rng.integers(2))))
+    return curved(organ, shape, rng, through=bool(rng.integers(2)))
+
+
+def _random_stroke(organ: Organ, seed: int) -> dict[str, Any]:
+    run = measure(organ, random_curve(organ, seed))
     if run.faces or run.error:
-        print(f'{shape}, seed {seed}: {run.faces} faces at {run.bridges[:1]}, {run.error[:150]}')
+        print(f'seed {seed}: {run.faces} faces at {run.bridges[:1]}, {run.error[:150]}')
     off = run.distances
     return {
         'seed': seed,
