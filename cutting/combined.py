@@ -52,7 +52,7 @@ _CLOSED = (
     '({:.1f}, {:.1f}, {:.1f}) mm at rest: elements with edges of {:.1f} mm are too large for a cut '
     'so small'
 )
-FOLDED = 'the blade crosses its own cut: the stroke goes on as a new one'
+FOLDED = 'the blade crosses or follows a cut: the stroke goes on as a new one'
 
 
 class CombinedMethod:

@@ -191,11 +191,22 @@ def _can_join(tables, node):
 
 
 @inner
+def _parts_nothing(tables, node):
+    """Return whether no edge leads from a node with a side to a node on the other one."""
+    for row in range(tables.counts[EDGES]):
+        waits = tables.edge_state[row] == WAITS_PLUS or tables.edge_state[row] == WAITS_MINUS
+        if not waits and (tables.edge_nodes[row, 0] == node or tables.edge_nodes[row, 1] == node):
+            return False
+    return True
+
+
+@inner
 def _contradicts(node, side, hit, normal, near, stroke):
     """Return whether a hit puts a node on another side than it has.
 
     A node nearly on the surface is put on the cut instead: the surface is curved, and has passed an
-    edge of it twice, or follows an earlier cut.
+    edge of it twice, or follows an earlier cut. Another one takes the other side where only
+    crossings at nodes on the cut have told its own: the surface has curved since.
     """
     tables = stroke.tables
     row = tables.node_row[node]
@@ -203,7 +214,10 @@ def _contradicts(node, side, hit, normal, near, stroke):
         return False
     above = abs(height(normal, hit[4:7], stroke.positions[node]))
     if above > near or not _can_join(tables, node):
-        return True
+        if side == SNAPPED or not _parts_nothing(tables, node):
+            return True
+        tables.node_side[row] = side
+        return False
     tables.node_side[row] = SNAPPED
     tables.node_state[row] = PENDING
     _lay_plane(row, hit, stroke)

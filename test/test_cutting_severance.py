@@ -59,6 +59,14 @@ def test_a_curved_stroke_leaves_no_bridge(plate, shape):
         assert run.faces == 0 or run.said
 
 
+def test_a_curved_stroke_that_begins_at_an_earlier_cut_is_not_broken_off():
+    """A long edge from the earlier cut told the side of a node, where the surface curves away."""
+    plate = slab()
+    run = measure(plate, four_arcs(plate, 2, np.random.default_rng(10)))
+    assert run.error == '' and run.free and run.faces == 0
+    assert run.folds == 0
+
+
 @pytest.mark.parametrize('seed', [31709, 32479])
 def test_new_nodes_that_would_make_flat_elements_stay_near_the_surface(seed):
     """At the middle of their edge, they were 0.31 and 0.22 edges off in these curves."""
