@@ -1,5 +1,6 @@
 """The recorded hand of a session: its poses, when each frame saw them, and the force on it."""
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,6 +19,7 @@ from cutting_trainer.node_common.cdr_codec import (
     StampedMessage,
     WrenchStampedCodec,
 )
+from cutting_trainer.node_common.rejections import MessageError
 from cutting_trainer.session.errors import SessionError
 
 _FRAME_NS, _TICK_NS = 33_333_333, 1_000_000
@@ -65,7 +67,9 @@ def computable_poses(bag: Bag) -> tuple[list[FrameRecord], list[StampedMessage]]
     poses = [pose for pose in poses if after < pose.stamp_ns <= until]
     if not poses:
         raise SessionError(f'{bag.path} has no message of {POSE}: there is no hand to follow')
-    return [replace(record, answered=answered.get(record.time, 0)) for record in records], poses
+    ends = [*map(time_of_contact, records[1:]), until]  # an answer comes before the next frame
+    answers = [min(answered.get(r.time, 0), end) for r, end in zip(records, ends, strict=True)]
+    return [replace(r, answered=at) for r, at in zip(records, answers, strict=True)], poses
 
 
 def times_of_frame(record: FrameRecord) -> tuple[int, int]:
@@ -104,10 +108,11 @@ def _poses(bag: Bag, since: int) -> tuple[list[StampedMessage], dict[int, int]]:
     for recorded in bag.messages([topic, FORCE]):
         if recorded.log_time < since:
             continue
-        if recorded.topic == topic:
-            poses.append(pose.decode(recorded.data))
-        elif poses:
-            answered[force.decode(recorded.data).stamp_ns] = poses[-1].stamp_ns
+        with contextlib.suppress(MessageError):  # no node has used such a message
+            if recorded.topic == topic:
+                poses.append(pose.decode(recorded.data))
+            elif poses:
+                answered[force.decode(recorded.data).stamp_ns] = poses[-1].stamp_ns
     return poses, answered
 
 
