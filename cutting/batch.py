@@ -154,16 +154,17 @@ def _sound_pieces(
     limits: SnapLimits,
 ) -> tuple[Pieces, _Moves, float, np.ndarray, np.ndarray]:
     """Divide the parents; below the altitude floor with new nodes farther from the ends of edges,
-    then at midpoints, then at nodes, and otherwise not at all. Return also the nodes on the cut,
-    and the parents.
+    then at midpoints, then later, with the crossings that are to come, then at nodes, and otherwise
+    not at all. Return also the nodes on the cut, and the parents.
     """
     parents = parents_concerned(mesh.links, tables, edges, nodes)
     front = scheme.tau if scheme.true_points else 0.5
     plain = np.zeros(0, np.int64)
     sliding = nodes if scheme.slides else nodes[:0]
     moves = _Moves(*slides(sliding, mesh.links, tables, mesh.rest, mesh.fixed, limits))
-    softened = False
-    for attempt in range(len(edges) + 3):
+    crossings = tables.edge_share[edges]
+    rows, shares = sliding, [_SMALL_SHARE, 0.5]
+    while True:
         pieces, unknown = subdivide(parents, mesh.links, tables, positions, mesh.rest, front, plain)
         if unknown >= 0:
             raise CutStateError(
@@ -174,22 +175,28 @@ def _sound_pieces(
         if len(bad) == 0:
             break
         cut = _cut_edges(tables, bad)
-        if attempt == 0 and _pull(tables, np.intersect1d(cut, edges), _SMALL_SHARE):
-            continue
-        if not softened:
-            softened = True
-            plain = np.array([edge_key(*tables.edge_nodes[row].tolist()) for row in cut], np.int64)
-            _pull(tables, np.intersect1d(cut, edges), 0.5)
-            stay = np.isin(tables.node_id[sliding], tables.parent_nodes[bad])
-            rows = np.ascontiguousarray(sliding[~stay])
+        pulled = _pull(tables, np.intersect1d(cut, edges), shares[0])
+        if len(shares) > 1:
+            shares = shares[1:]
+            if pulled:
+                continue
+            pulled = _pull(tables, np.intersect1d(cut, edges), shares[0])
+        centred = np.union1d(plain, [edge_key(*ends) for ends in tables.edge_nodes[cut].tolist()])
+        stay = np.isin(tables.node_id[rows], tables.parent_nodes[bad])
+        if pulled or stay.any() or len(centred) > len(plain):
+            plain = centred.astype(np.int64)
+            rows = np.ascontiguousarray(rows[~stay])
             moves = _Moves(*slides(rows, mesh.links, tables, mesh.rest, mesh.fixed, limits))
-        else:
-            more = [put_on_cut(tables, int(parent), edges, positions) for parent in bad]
-            nodes = np.concatenate([nodes, *more])
-            if not sum(map(len, more)) and not sum(block(tables, int(p), edges) for p in bad):
-                break
-            # Those around the nodes that were put on the cut just now.
+            continue
+        if _leave_for_later(tables, bad, edges, crossings):
             parents = parents_concerned(mesh.links, tables, edges, nodes)
+            continue
+        more = [put_on_cut(tables, int(parent), edges, positions) for parent in bad]
+        nodes = np.concatenate([nodes, *more])
+        if not sum(map(len, more)) and not sum(block(tables, int(p), edges) for p in bad):
+            break
+        # Those around the nodes that were put on the cut just now.
+        parents = parents_concerned(mesh.links, tables, edges, nodes)
     if len(pieces.corners) and worst <= 0.0:
         raise CutStateError('an element would be inverted; abort the stroke')
     return pieces, moves, float(worst), nodes, parents
@@ -209,6 +216,32 @@ def _pull(tables: Tables, edges: np.ndarray, least: float) -> bool:
     before = tables.edge_share[edges]
     tables.edge_share[edges] = np.clip(before, least, 1.0 - least)
     return bool((tables.edge_share[edges] != before).any())
+
+
+def _leave_for_later(
+    tables: Tables, parents: np.ndarray, edges: np.ndarray, crossings: np.ndarray
+) -> bool:
+    """Leave new crossings to a later batch where others of the same parent are still to come.
+
+    Args:
+        tables: of the stroke; changed.
+        parents: rows.
+        edges: rows of the edges that are new in the batch, shape (k,).
+        crossings: where they are crossed, as shares, shape (k,).
+
+    Returns:
+        Whether there are any.
+    """
+    found = False
+    for base in tables.parent_nodes[parents].tolist():
+        rows = np.array([find_edge(tables, base[i], base[j]) for i, j in _PAIRS])
+        states = np.where(rows >= 0, tables.edge_state[rows], 0)
+        new = np.isin(edges, rows[states == DONE])
+        if (states == PENDING).any() and new.any():
+            tables.edge_state[edges[new]] = PENDING
+            tables.edge_share[edges[new]] = crossings[new]
+            found = True
+    return found
 
 
 def _assemble(
