@@ -163,7 +163,6 @@ def _sound_pieces(
     sliding = nodes if scheme.slides else nodes[:0]
     moves = _Moves(*slides(sliding, mesh.links, tables, mesh.rest, mesh.fixed, limits))
     crossings = tables.edge_share[edges]
-    rows, shares = sliding, [_SMALL_SHARE, 0.5]
     while True:
         pieces, unknown = subdivide(parents, mesh.links, tables, positions, mesh.rest, front, plain)
         if unknown >= 0:
@@ -175,18 +174,16 @@ def _sound_pieces(
         if len(bad) == 0:
             break
         cut = _cut_edges(tables, bad)
-        pulled = _pull(tables, np.intersect1d(cut, edges), shares[0])
-        if len(shares) > 1:
-            shares = shares[1:]
-            if pulled:
-                continue
-            pulled = _pull(tables, np.intersect1d(cut, edges), shares[0])
+        new = np.intersect1d(cut, edges)
+        if _pull(tables, new, _SMALL_SHARE):
+            continue
+        pulled = _pull(tables, new, 0.5)
         centred = np.union1d(plain, [edge_key(*ends) for ends in tables.edge_nodes[cut].tolist()])
-        stay = np.isin(tables.node_id[rows], tables.parent_nodes[bad])
+        stay = np.isin(tables.node_id[sliding], tables.parent_nodes[bad])
         if pulled or stay.any() or len(centred) > len(plain):
             plain = centred.astype(np.int64)
-            rows = np.ascontiguousarray(rows[~stay])
-            moves = _Moves(*slides(rows, mesh.links, tables, mesh.rest, mesh.fixed, limits))
+            sliding = np.ascontiguousarray(sliding[~stay])
+            moves = _Moves(*slides(sliding, mesh.links, tables, mesh.rest, mesh.fixed, limits))
             continue
         if _leave_for_later(tables, bad, edges, crossings):
             parents = parents_concerned(mesh.links, tables, edges, nodes)
