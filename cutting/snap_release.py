@@ -61,6 +61,18 @@ def _is_far(row, stroke):
 
 
 @inner
+def _is_small(row, stroke):
+    """Return whether an element around a node is too small to be divided."""
+    star = incident_tetrahedra(stroke.tables.node_id[row], stroke.links, stroke.tables)
+    rest = stroke.rest
+    for k in range(len(star)):
+        a, b, c, d = star[k, 0], star[k, 1], star[k, 2], star[k, 3]
+        if altitude(rest[a], rest[b], rest[c], rest[d]) < stroke.limits.small:
+            return True
+    return False
+
+
+@inner
 def _divides_small(row, stroke):
     """Return whether an element is too small to be divided that would be if a node took a side."""
     tables, rest = stroke.tables, stroke.rest
@@ -177,7 +189,7 @@ def settle_waiting(active, stroke, subdivides):
             continue
         if np.int64(tables.node_id[row]) in held:
             continue
-        if demands[row] == _BOTH or not subdivides or _divides_small(row, stroke):
+        if demands[row] == _BOTH or not subdivides or _is_small(row, stroke):
             tables.node_state[row] = PENDING
         elif state == 0 or _is_far(row, stroke):
             _take_side(row, demands[row], tables)

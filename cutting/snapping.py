@@ -86,27 +86,22 @@ def _nearness(star, point, stroke):
         stroke: a `SnapStroke`.
 
     Returns:
-        Least share of an edge, 1 if none is crossed; the same of small elements; and the least
-        altitude around the node [m].
+        Least share of an edge, 1 if none is crossed; and the least altitude around the node [m].
     """
     positions, rest, direction = stroke.positions, stroke.rest, stroke.direction
     above = height(direction, point, positions[star[0, 0]])
     longest = 0.0
-    nearest = in_small = 1.0
+    nearest = 1.0
     smallest = np.inf
     for k in range(len(star)):
         a, b, c, d = star[k, 0], star[k, 1], star[k, 2], star[k, 3]
-        size = altitude(rest[a], rest[b], rest[c], rest[d])
-        smallest = min(smallest, size)
+        smallest = min(smallest, altitude(rest[a], rest[b], rest[c], rest[d]))
         for i in range(1, 4):
             far = height(direction, point, positions[star[k, i]])
             longest = max(longest, abs(far))
             if far * above < 0.0:
-                share = abs(above) / (abs(above) + abs(far))
-                nearest = min(nearest, share)
-                if size < stroke.limits.small:
-                    in_small = min(in_small, share)
-    return (0.0 if abs(above) <= _EXACT * longest else nearest), in_small, smallest
+                nearest = min(nearest, abs(above) / (abs(above) + abs(far)))
+    return (0.0 if abs(above) <= _EXACT * longest else nearest), smallest
 
 
 @inner
@@ -119,8 +114,8 @@ def _is_near(node, point, stroke):
     """
     limits = stroke.limits
     star = incident_tetrahedra(node, stroke.links, stroke.tables)
-    nearest, in_small, smallest = _nearness(star, point, stroke)
-    if limits.tau == 0.5 or in_small <= 0.5:
+    nearest, smallest = _nearness(star, point, stroke)
+    if limits.tau == 0.5 or smallest < limits.small:
         return nearest <= 0.5
     if nearest >= limits.tau or nearest == 0.0:
         return nearest < limits.tau
