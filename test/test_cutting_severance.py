@@ -67,6 +67,14 @@ def test_a_curved_stroke_that_begins_at_an_earlier_cut_is_not_broken_off():
     assert run.folds == 0
 
 
+def test_a_crossing_waits_for_the_others_of_an_element_that_would_be_too_flat():
+    """A node far from the blade was put on the cut instead, 0.69 edges off."""
+    plate = slab()
+    run = measure(plate, four_arcs(plate, 3, np.random.default_rng(202)))
+    assert run.error == '' and run.free and run.faces == 0
+    assert run.distances.max() < 0.3
+
+
 @pytest.mark.parametrize('seed', [31709, 32479])
 def test_new_nodes_that_would_make_flat_elements_stay_near_the_surface(seed):
     """At the middle of their edge, they were 0.31 and 0.22 edges off in these curves."""
