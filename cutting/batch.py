@@ -185,14 +185,12 @@ def _sound_pieces(
             sliding = np.ascontiguousarray(sliding[~stay])
             moves = _Moves(*slides(sliding, mesh.links, tables, mesh.rest, mesh.fixed, limits))
             continue
-        if _leave_for_later(tables, bad, edges, crossings):
-            parents = parents_concerned(mesh.links, tables, edges, nodes)
-            continue
-        more = [put_on_cut(tables, int(parent), edges, positions) for parent in bad]
-        nodes = np.concatenate([nodes, *more])
-        if not sum(map(len, more)) and not sum(block(tables, int(p), edges) for p in bad):
-            break
-        # Those around the nodes that were put on the cut just now.
+        if not _leave_for_later(tables, bad, edges, crossings):
+            more = [put_on_cut(tables, int(parent), edges, positions) for parent in bad]
+            nodes = np.concatenate([nodes, *more])
+            if not sum(map(len, more)) and not sum(block(tables, int(p), edges) for p in bad):
+                break
+        # Also those around the nodes that were put on the cut just now.
         parents = parents_concerned(mesh.links, tables, edges, nodes)
     if len(pieces.corners) and worst <= 0.0:
         raise CutStateError('an element would be inverted; abort the stroke')
