@@ -174,7 +174,8 @@ def test_a_lost_connection_is_said_and_the_stop_pressed_meanwhile_arrives_first(
 def test_news_that_is_old_is_called_old(browser: Browser) -> None:
     stand_in = StandIn('block')
     with opened(browser, stand_in) as page:
-        assert not page.state()['stale']
+        # The first picture may take long to draw: until then the page has no news to show.
+        page.wait(lambda: not page.state()['stale'], 'the first news')
         stand_in.stands_still.set()
         page.wait(lambda: page.says('No news from the session'), 'the banner')
         assert page.state()['connection'] == 'open'
