@@ -30,6 +30,7 @@ from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.incoming import tool_contact
 from cutting_trainer.tissue_sim.contact.tool import ContactState, Frame
 from cutting_trainer.tissue_sim.elasticity.material import Material
+from cutting_trainer.tissue_sim.motion.parallel_euler import ParallelEuler
 from cutting_trainer.tissue_sim.simulation.serialisation import (
     ObjectState,
     StateError,
@@ -148,11 +149,22 @@ def going_on(
             id='viscous-law',
             marks=pytest.mark.thorough,
         ),
+        pytest.param({'tissue.budget.cores': '3', 'tissue.model': 'stiffening'}, id='threads'),
+        pytest.param(
+            {
+                'tissue.budget.cores': '2',
+                'tissue.model': 'stiffening',
+                'tissue.active_region': '{mode: budget, nodes: 60}',
+            },
+            id='threads-budget',
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_frames_go_on_from_the_state_of_any_frame_with_the_same_bits(
-    tmp_path: Path, changes: dict[str, str]
+    tmp_path: Path, changes: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(ParallelEuler, 'min_nodes', 0)
     scene = load_scene(str(restore_scene(open_bag(SAMPLE), tmp_path, changes)))
     moments, kept = played(scene)
     before = {

@@ -102,10 +102,13 @@ from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.session.scene_overrides import write_changed
 from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.tool import indenter_contact
+from cutting_trainer.tissue_sim.motion.parallel_euler import ParallelEuler
 
+ParallelEuler.min_nodes = 0
 changes = {
     'tissue.active_region': '{mode: budget, nodes: 20}',
     'tissue.material.prony': '[[0.3, 0.1]]',
+    'tissue.budget.cores': sys.argv[2],
 }
 scene = load_scene(str(write_changed(load_scene('block'), Path(sys.argv[1]), changes)))
 simulation, _ = make_simulation(scene.tissue)
@@ -153,8 +156,11 @@ def test_warm_up_leaves_no_kernel_to_be_compiled_in_a_session() -> None:
     assert later.endswith(' loaded later: {}'), later
 
 
-def test_a_scene_with_far_field_and_viscosity_has_loaded_their_kernels(tmp_path: Path) -> None:
-    (later,) = said(SELDOM, str(tmp_path))
+@pytest.mark.parametrize('cores', ['1', '2'])
+def test_a_scene_with_far_field_viscosity_or_threads_has_loaded_their_kernels(
+    tmp_path: Path, cores: str
+) -> None:
+    (later,) = said(SELDOM, str(tmp_path), cores)
     assert later.endswith(' loaded later: {}'), later
 
 

@@ -175,6 +175,7 @@ def make_simulation(
         friction=settings.material.dry_friction,
         gravity=settings.gravity,
         tools=tools,
+        threads=settings.budget.threads,
     )
     if before is None:
         simulation.dynamics.settle()
@@ -190,8 +191,8 @@ def load_kernels(settings: TissueSettings) -> None:
         settings: its section `tissue`, with a known method.
     """
     far_field = settings.active_region.mode == 'budget'
-    viscous = bool(settings.material.prony)
-    warm_up_method(settings.integrator, far_field=far_field, viscous=viscous)
+    viscous, parallel = bool(settings.material.prony), settings.budget.threads > 1
+    warm_up_method(settings.integrator, far_field=far_field, viscous=viscous, parallel=parallel)
 
 
 def as_planned(settings: TissueSettings, found: Plan | None) -> TissueSettings:

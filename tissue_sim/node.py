@@ -1,5 +1,6 @@
 """The node `tissue_sim`: simulates the tissue at 30 Hz."""
 
+import os
 import time
 from pathlib import Path
 
@@ -83,6 +84,7 @@ class TissueSimNode(ManagedNode):
         self._take(simulation, 0 if before is None else before.revision)
         self._anew: TissueSimulation | None = None
         self._log_plan()
+        self._check_processors(settings.budget.threads)
         self._announce_method(self._settings)
         text = 'largest data rate of meshes and their deltas [bytes/s]; 0: no limit'
         self._link = LinkBudget(
@@ -129,6 +131,14 @@ class TissueSimNode(ManagedNode):
             self.get_logger().info(sentence)
         for sentence in self._plan.warnings:
             self.get_logger().warning(sentence)
+
+    def _check_processors(self, threads: int) -> None:
+        processors = len(os.sched_getaffinity(0))
+        if threads > processors:
+            self.get_logger().warning(
+                f'{threads} threads compute the tissue, as tissue.budget.cores says, on '
+                f'{processors} of the processors: frames take longer than planned'
+            )
 
     def _announce_method(self, taken: TissueSettings) -> None:
         """Publish the method of computation; a re-simulation of the bag uses it."""

@@ -10,7 +10,7 @@ from itertools import permutations
 import numpy as np
 
 from cutting_trainer.tissue_sim.contact.blade import Resistance
-from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.coupling import PUSH, Coupling, springs_of
 from cutting_trainer.tissue_sim.contact.cut_contact_search import NearFaces
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact
 from cutting_trainer.tissue_sim.elasticity.compliance import PointCompliance
@@ -27,6 +27,7 @@ from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh, TopologyDelta
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import INTEGRATORS, IntegratorName
+from cutting_trainer.tissue_sim.motion.parallel_euler import ParallelEuler
 from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 
@@ -36,16 +37,20 @@ _STEPPING = TimeStepping('symplectic_euler')
 
 
 def warm_up() -> None:
-    """Run every model and integrator, far fields and viscosity; move a tool through a cube, and
-    remove an element.
+    """Run every model and integrator, far fields, viscosity and threads; move a tool through a
+    cube, and remove an element.
     """
     for integrator in INTEGRATORS:
         warm_up_method(integrator)
-    warm_up_method(integrator, far_field=True, viscous=True)
+    warm_up_method(integrator, far_field=True, viscous=True, parallel=True)
 
 
 def warm_up_method(
-    integrator: IntegratorName, *, far_field: bool = False, viscous: bool = False
+    integrator: IntegratorName,
+    *,
+    far_field: bool = False,
+    viscous: bool = False,
+    parallel: bool = False,
 ) -> None:
     """Run every model, and one integrator; move a tool through a cube, and remove an element.
 
@@ -56,6 +61,7 @@ def warm_up_method(
     Args:
         integrator: name.
         far_field, viscous: whether a tissue has a far field or viscosity.
+        parallel: whether several threads compute a frame.
     """
     warm_up_models()
     warm_up_frames(integrator)
@@ -63,6 +69,8 @@ def warm_up_method(
         _warm_up_far_field()
     if viscous:
         _warm_up_viscosity()
+    if parallel:
+        _warm_up_threads()
 
 
 @cache
@@ -135,12 +143,27 @@ def _warm_up_viscosity() -> None:
     Dynamics(small_cube(), viscous, 'stiffening', _STEPPING).advance(Coupling())
 
 
-def _move_every_model(active: ActiveSettings) -> None:
+@cache
+def _warm_up_threads() -> None:
+    """Move a cube by two threads. Only the first call does anything."""
+    cube, n = ElasticModel(small_cube(), _MATERIAL), 8
+    springs = springs_of((_touching(),), cube.mesh.rest)
+    u, v = np.zeros((2, 3 * n))
+    euler = ParallelEuler('symplectic_euler', _MATERIAL.alpha, _MATERIAL.beta, threads=2)
+    euler.min_nodes = 0
+    euler.step(cube.operands(), np.ones(3 * n), cube.diagonal, springs, u, v, 1e-4, 1)
+
+
+def _touching() -> Coupling:
+    """Return the coupling of a tool that pulls a corner of the cube."""
     top = np.full(3, 0.01)
-    touching = Coupling(PUSH, np.array([7]), np.ones(1), top, top, stiffness=1.0)
+    return Coupling(PUSH, np.array([7]), np.ones(1), top, top, stiffness=1.0)
+
+
+def _move_every_model(active: ActiveSettings) -> None:
     for model in MODELS:
         cube = Dynamics(small_cube(), _MATERIAL, model, _STEPPING, active)
-        for coupling in (Coupling(), touching, Coupling()):
+        for coupling in (Coupling(), _touching(), Coupling()):
             cube.advance(coupling)
 
 

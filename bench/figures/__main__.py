@@ -60,12 +60,12 @@ SUBJECTS = {
         },
     ),
     'scale': Subject(
-        modules=('scale_far_field',),
+        modules=('scale_far_field', 'scale_threads'),
         not_covered={
             1: 'of it: 197,472 tetrahedra cut, and their frame, which take minutes: '
             '`python -m bench.accuracy.far_field_session 197472`',
             2: 'it needs a live session on a quiet machine: `./trainer bench timing`',
-            3: 'a tissue has one thread: there is no option of cores yet',
+            3: 'of it: eight cores, on paper in docs/performance.md',
             4: 'a thousand strokes take minutes: `./trainer bench strokes`',
             5: 'it needs a live session on a quiet machine: '
             '`python -m bench.figures.scale_governor`',

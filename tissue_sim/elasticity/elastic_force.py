@@ -92,7 +92,7 @@ def internal_force(operands, u, f, rotation_steps):
         negative.
     """
     lead_far_nodes(operands.coarse, u, 1.0)
-    energy = _elastic_force(operands, u, f, rotation_steps)
+    energy = elastic_force(operands, u, f, rotation_steps)
     if operands.load.shape[0] > 0:
         _subtract(operands.load, operands.reach, f)
     put_coarse_forces(operands.coarse, u, f, 1.0)
@@ -107,7 +107,8 @@ def _subtract(load, reach, f):
 
 
 @inner(error_model='numpy')
-def _elastic_force(operands, u, f, rotation_steps):
+def elastic_force(operands, u, f, rotation_steps):
+    """Compute `internal_force` without load and coarse unknowns."""
     if operands.local.first.shape[0] > 0:
         local_product(operands.local, u, f)
         return 0.0

@@ -36,9 +36,9 @@ from cutting_trainer.tissue_sim.motion.divergence import DivergenceDetector
 from cutting_trainer.tissue_sim.motion.elastic_state import ElasticState
 from cutting_trainer.tissue_sim.motion.far_field import SHARES, FarField
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
-from cutting_trainer.tissue_sim.motion.integrators import Integrator
 from cutting_trainer.tissue_sim.motion.loads import Loads
 from cutting_trainer.tissue_sim.motion.nodal_mass import NodalMass
+from cutting_trainer.tissue_sim.motion.parallel_euler import make_integrator
 from cutting_trainer.tissue_sim.motion.stiffened_mass import SUBSTEPS_BETWEEN
 from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping, TimeSteps
 
@@ -61,6 +61,7 @@ class Dynamics:
         active: selection of the moving nodes.
         gravity: acceleration [m/s^2].
         friction: coefficient between cut faces.
+        threads: that compute a frame.
 
     Attributes:
         cut_contact: of cut faces; with `implicit` they do not meet.
@@ -80,6 +81,7 @@ class Dynamics:
         active: ActiveSettings | None = None,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         friction: float = 0.0,
+        threads: int = 1,
     ) -> None:
         self.mesh = mesh
         self.cut_contact = CutContact(mesh, friction)
@@ -89,7 +91,8 @@ class Dynamics:
         self._falls = any(gravity)
         self.loads = Loads(self.model, gravity) if loaded else None
         self.stepping = stepping or TimeStepping()
-        self._integrator = Integrator(self.stepping.integrator, material.alpha, material.beta)
+        damping = material.alpha, material.beta
+        self._integrator = make_integrator(self.stepping.integrator, *damping, threads)
         size = 3 * mesh.node_count
         self._u, self._v = np.zeros(size), np.zeros(size)
         self.masses = NodalMass(self.model, self.stepping.frequency_growth)

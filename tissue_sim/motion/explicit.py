@@ -19,7 +19,8 @@ from cutting_trainer.tissue_sim.elasticity.elastic_force import internal_force
 
 
 @inner(error_model='numpy')
-def _copy(intervals, source, target):
+def copy_nodes(intervals, source, target):
+    """Copy the coordinates of some nodes."""
     for s in range(intervals.shape[0]):
         a, b = 3 * intervals[s, 0], 3 * intervals[s, 1]
         for i in range(a, b):
@@ -27,19 +28,30 @@ def _copy(intervals, source, target):
 
 
 @inner(error_model='numpy')
-def _ahead(q, u, v, beta):
+def look_ahead(q, u, v, beta):
+    """Write u + beta v."""
     for i in range(q.shape[0]):
         q[i] = u[i] + beta * v[i]
 
 
 @inner(error_model='numpy')
-def _euler(u, v, q, f, inverse_mass, alpha, beta, dt, symplectic):
+def step_of_euler(u, v, q, f, inverse_mass, alpha, beta, dt, symplectic):
     """Compute a step, and q = u + beta v for the next, while the data are in the cache."""
     for i in range(u.shape[0]):
         before = v[i]
         after = before + dt * (-f[i] * inverse_mass[i] - alpha * before)
         place = u[i] + dt * (after if symplectic else before)
         u[i], v[i], q[i] = place, after, place + beta * after
+
+
+@inner(error_model='numpy')
+def pull_by_springs(springs, at, u, q, f, forces, last, symplectic):
+    """Subtract the springs' forces from f at a moment of the frame; return their work [J]."""
+    subtract_springs(springs, at, u if symplectic else q, f, forces)
+    if not symplectic:
+        # Of the springs alone: their damping force does no work on the tissue.
+        forces_of_springs(springs, at, u, forces)
+    return work_of_springs(springs, forces, u, last)
 
 
 @inner(error_model='numpy')
@@ -82,27 +94,24 @@ def euler_steps(
     """
     alpha, beta = damping[0], damping[1]
     q, f = work[2, : u.shape[0]], work[3, : u.shape[0]]
-    held = u if symplectic else q
     tools = springs.modes.shape[0]
     forces, last = np.zeros((tools, 3)), np.zeros((tools, 2, 3))
     done = start_of_work(springs, u, last)
-    _copy(operands.reach, u, q)
+    copy_nodes(operands.reach, u, q)
     for s in range(spans.shape[0]):
         a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-        _ahead(q[a:b], u[a:b], v[a:b], beta)
+        look_ahead(q[a:b], u[a:b], v[a:b], beta)
     for step in range(first, first + steps):
         internal_force(operands, q, f, np.int64(1))
         if faces.at.shape[0] > 0:
             subtract_pulls(faces, f)
         if tools > 0:
-            subtract_springs(springs, step / total, held, f, forces)
-            if not symplectic:
-                # Of the springs alone: their damping force does no work on the tissue.
-                forces_of_springs(springs, step / total, u, forces)
-            done += work_of_springs(springs, forces, u, last)
+            done += pull_by_springs(springs, step / total, u, q, f, forces, last, symplectic)
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-            _euler(u[a:b], v[a:b], q[a:b], f[a:b], inverse_mass[a:b], alpha, beta, dt, symplectic)
+            step_of_euler(
+                u[a:b], v[a:b], q[a:b], f[a:b], inverse_mass[a:b], alpha, beta, dt, symplectic
+            )
         if faces.at.shape[0] > 0:
             meet(faces, u, v, q, beta, dt)
     if tools > 0:
@@ -127,7 +136,7 @@ def rk4_steps(
     tools = springs.modes.shape[0]
     forces, last = np.zeros((tools, 3)), np.zeros((tools, 2, 3))
     done = start_of_work(springs, u, last)
-    _copy(operands.reach, u, q)
+    copy_nodes(operands.reach, u, q)
     for step in range(first, first + steps):
         for s in range(spans.shape[0]):
             a, b = 3 * spans[s, 0], 3 * spans[s, 1]
@@ -138,7 +147,7 @@ def rk4_steps(
         for stage in range(4):
             for s in range(spans.shape[0]):
                 a, b = 3 * spans[s, 0], 3 * spans[s, 1]
-                _ahead(q[a:b], us[a:b], vs[a:b], beta)
+                look_ahead(q[a:b], us[a:b], vs[a:b], beta)
             internal_force(operands, q, f, np.int64(1))
             if faces.at.shape[0] > 0:
                 subtract_pulls(faces, f)

@@ -1,6 +1,6 @@
 """Integrators with one interface: steps of M u'' + (alpha M + beta K) u' + K u = f in place."""
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -76,4 +76,8 @@ class Integrator:
             return float(implicit_steps(*head, diagonal, self._tolerance, *tail))
         if self.name == 'rk4':
             return float(rk4_steps(*head, faces, *tail))
-        return float(euler_steps(*head, faces, *tail, self.name == 'symplectic_euler'))
+        return self._euler(*head, faces, *tail, self.name == 'symplectic_euler')
+
+    def _euler(self, *given: Any) -> float:
+        """Compute steps of Euler's methods, see `euler_steps`."""
+        return float(euler_steps(*given))

@@ -1,8 +1,9 @@
 """Section `tissue.budget` of a scene: the requirements on the tissue."""
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from cutting_trainer.node_common.scene_reader import SceneModel
+from cutting_trainer.tissue_sim.motion.parallel_euler import MAX_THREADS
 
 
 class Budget(SceneModel):
@@ -36,6 +37,21 @@ class Budget(SceneModel):
     cores: float = Field(
         default=0.5,
         gt=0,
-        le=1,
-        description='share of a core that the simulation may use [-], above 0 to 1; it runs on one',
+        le=MAX_THREADS,
+        description='share of a core that the simulation may use, above 0 to 1; or how many cores, '
+        "2 to 64: so many threads compute a frame by Euler's methods, where they gain by it [-]",
     )
+
+    @field_validator('cores')
+    @classmethod
+    def _check_whole(cls, cores: float) -> float:
+        if cores > 1 and cores != int(cores):
+            raise ValueError(
+                f'{cores:g} is neither a share of a core, up to 1, nor a whole number of cores'
+            )
+        return cores
+
+    @property
+    def threads(self) -> int:
+        """Threads that compute a frame."""
+        return max(1, int(self.cores))

@@ -128,8 +128,8 @@ class Task:
 
     @property
     def available(self) -> float:
-        """CPU time allowed for a frame [s]."""
-        return self.budget.cores / self.stepping.rate
+        """Time allowed for a frame: CPU time of one thread, or time of several [s]."""
+        return min(self.budget.cores, 1.0) / self.stepping.rate
 
     def worst(self, candidate: Candidate) -> Cost:
         """Return the cost of a method after cuts have shortened the step as far as allowed.

@@ -142,8 +142,15 @@ class _Timed:
             s, integrator=integrator, min_substeps=min(s.min_substeps, most), max_substeps=most
         )
         self._simulation = TissueSimulation(
-            task.mesh, task.material, uncut(task), model=model, stepping=stepping, active=active
+            task.mesh,
+            task.material,
+            uncut(task),
+            model=model,
+            stepping=stepping,
+            active=active,
+            threads=task.budget.threads,
         )
+        self._task = task
         self._contacts = _in_and_out(task, indenter, depth)
         self._times: list[list[float]] = []
         self.substeps, self.step = 0, 0.0
@@ -153,7 +160,7 @@ class _Timed:
         for _ in range(repeats):
             times = []
             for contact in self._contacts:
-                frame, spent = _timed(self._simulation, contact)
+                frame, spent = _timed(self._task, self._simulation, contact)
                 times.append(spent)
             self._times.append(times[1:])
         needed = frame.substeps / max(frame.slow_motion, 1e-12)
@@ -178,11 +185,14 @@ def _in_and_out(task: Task, indenter: Indenter, depth: float) -> list[ToolContac
     return [indenter_contact(task.mesh, *place, share * depth, _COUPLING) for share in shares]
 
 
-def _timed(simulation: TissueSimulation, contact: ToolContact | None) -> tuple[Frame, float]:
-    """Return a frame, and its CPU time [s]."""
-    start = time.thread_time()
+def _timed(
+    task: Task, simulation: TissueSimulation, contact: ToolContact | None
+) -> tuple[Frame, float]:
+    """Return a frame, and its CPU time; of several threads its time, in which they wait too [s]."""
+    clock = time.thread_time if task.budget.threads == 1 else time.perf_counter
+    start = clock()
     frame = simulation.frame(contact)
-    return frame, time.thread_time() - start
+    return frame, clock() - start
 
 
 def with_blade(task: Task, candidate: Candidate) -> Candidate:
@@ -203,10 +213,11 @@ def with_blade(task: Task, candidate: Candidate) -> Candidate:
         model=candidate.model,
         stepping=task.stepped_by(candidate),
         active=candidate.active,
+        threads=task.budget.threads,
     )
     spent: list[float] = []
     for contact in _drawn(task):
-        frame, seconds = _timed(simulation, contact)
+        frame, seconds = _timed(task, simulation, contact)
         if frame.command is not None:
             simulation.cut_done()
         if simulation.blade is not None:
@@ -254,7 +265,9 @@ class _Strokes:
             model=candidate.model,
             stepping=task.stepped_by(candidate),
             active=active,
+            threads=task.budget.threads,
         )
+        self._task = task
         indenter = places(task.mesh, task.budget.contact_radius, 1)[0]
         self._contacts = _in_and_out(task, indenter, depth)
         self._times: list[list[float]] = []
@@ -263,7 +276,7 @@ class _Strokes:
         """Return the displacement after each frame [m], shape (f, n, 3)."""
         times, seen = [], []
         for contact in [*self._contacts, *[None] * _FRAMES]:
-            times.append(_timed(self._simulation, contact)[1])
+            times.append(_timed(self._task, self._simulation, contact)[1])
             seen.append(self._simulation.displacement.copy())
         self._times.append(times[1:_FRAMES])
         return np.array(seen)

@@ -39,6 +39,7 @@ class TissueSimulation:
         friction: of the tool on the surface.
         gravity: acceleration [m/s^2]; `Dynamics.settle` finds the shape at rest under it.
         tools: how many there are.
+        threads: that compute a frame, see `parallel_euler`.
 
     Attributes:
         tools: their states.
@@ -61,10 +62,13 @@ class TissueSimulation:
         friction: Friction = NO_FRICTION,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         tools: int = 1,
+        threads: int = 1,
     ) -> None:
         self.mesh = mesh
         self.material = material
-        self.dynamics = Dynamics(mesh, material, model, stepping, active, gravity, CUT_FRICTION)
+        self.dynamics = Dynamics(
+            mesh, material, model, stepping, active, gravity, CUT_FRICTION, threads
+        )
         self.step = 0
         self.elements_cut = 0
         self.tools = [ToolState(self.dynamics, resistance, contact, friction) for _ in range(tools)]

@@ -21,6 +21,7 @@ from cutting_trainer.tissue_sim.elasticity.viscosity import ViscousNodes
 from cutting_trainer.tissue_sim.elasticity.viscous_stress import KEPT as KEPT_OF_TERM
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
+from cutting_trainer.tissue_sim.motion.parallel_euler import MAX_THREADS, ParallelEuler
 from cutting_trainer.tissue_sim.simulation.serialisation import StateError
 from cutting_trainer.tissue_sim.simulation.simulation import TissueSimulation
 from cutting_trainer.tissue_sim.simulation.tool_state import ToolState
@@ -289,9 +290,11 @@ def _check_estimates(simulation: TissueSimulation, n: int) -> None:
     """Check the estimates of frequency and compliance, and the integrator."""
     dynamics = simulation.dynamics
     has_room('_f', dynamics.masses._frequency._f, 0)
-    work: Any = dynamics._integrator._work
-    has_room('_work', work, 7, *work.shape[1:])
-    has_room('_damping', dynamics._integrator._damping, 2)
+    integrator: Any = dynamics._integrator
+    has_room('_work', integrator._work, 7, *integrator._work.shape[1:])
+    has_room('_damping', integrator._damping, 2)
+    if isinstance(integrator, ParallelEuler):
+        within('_threads', [integrator._threads], MAX_THREADS + 1, 2)
 
 
 def _check_far_field(dynamics: Any, n: int) -> None:
