@@ -1,4 +1,4 @@
-"""What two threads gain in moving all nodes, beside what they gain in reading the same bytes.
+"""Gain of two threads in moving all nodes, beside their gain in reading the same bytes.
 
 `./trainer run python -m bench.figures.scale_threads` prints both by model, on a quiet machine.
 """

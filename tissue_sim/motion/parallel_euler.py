@@ -44,7 +44,7 @@ _COPY, _AHEAD, _FAR, _FORCE, _PULL, _MOVE, _MEET = range(7)
 
 
 class Account(NamedTuple):
-    """What the steps keep of the springs, t of them.
+    """Account of the work of the springs, t of them.
 
     Attributes:
         pulls, last: see `coupling.work_of_springs`, shapes (t, 3) and (t, 2, 3).

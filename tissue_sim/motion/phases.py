@@ -81,7 +81,7 @@ def _add_in_python(board: np.ndarray, index: int, value: int) -> int:
 
 @_operation(_add_in_python)
 def _add(typing: Any, board: Any, index: Any, value: Any) -> Any:
-    """Add to a number that other threads change; return what it was."""
+    """Add to a number that other threads change; return its value before."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         place = _place(context, builder, signature, given)
