@@ -6,8 +6,8 @@ With `NUMBA_DISABLE_JIT=1` both leave a function as it is.
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit
-from numba.extending import overload, register_jitable
+from numba import config, njit
+from numba.extending import intrinsic, overload, register_jitable
 from numba.np import arrayobj
 
 from cutting_trainer.node_common.linked_code import link_inner_functions
@@ -25,6 +25,15 @@ def inner(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function where a kernel calls it, see `linked_code`; Python interprets it."""
     compiled = register_jitable(**_OPTIONS | options)
     return compiled if function is None else compiled(function)
+
+
+def operation(in_python: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the decorator of an intrinsic operation, see `numba.extending.intrinsic`.
+
+    Args:
+        in_python: its Python version for NUMBA_DISABLE_JIT=1, for debugging.
+    """
+    return (lambda _: in_python) if config.DISABLE_JIT else intrinsic
 
 
 def _raise_for_shape(source: Any, target: Any) -> None:

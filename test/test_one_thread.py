@@ -1,4 +1,5 @@
-"""The tissue is simulated by one thread: the other core is the force loop's.
+"""The tissue is simulated by one thread, unless its budget has several cores: the other core is
+the force loop's.
 
 BLAS computes long sums in several threads, which then wait for the next in a loop: one that is used
 once a frame takes a whole core, and is no faster by it.

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from cutting_trainer.node_common.errors import SceneError
 from cutting_trainer.session.in_process import simulate
 from cutting_trainer.session.scene_loader import load_scene
 from cutting_trainer.session.scene_overrides import write_changed
+from cutting_trainer.tissue_sim.assembly import make_simulation
 from cutting_trainer.tissue_sim.contact.blade import Resistance
 from cutting_trainer.tissue_sim.contact.coupling import HOLD, PUSH, Coupling
+from cutting_trainer.tissue_sim.contact.tool import indenter_contact
 from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
@@ -164,30 +167,49 @@ def test_a_tissue_is_cut_as_by_one_thread(tmp_path: Path) -> None:
     np.testing.assert_allclose(shared, alone, atol=1e-6)
 
 
-@pytest.mark.parametrize('threads', [1, 17, 10**9, 2.0])
-def test_a_recorded_state_starts_no_other_number_of_threads_than_a_scene(threads: float) -> None:
+def recorded(model: ModelName = 'linear', mode: Literal['off', 'on'] = 'off') -> TissueSimulation:
+    """A simulation by three threads, after a frame."""
     mesh, material = block()
     euler, none = TimeStepping('symplectic_euler'), Resistance(1.0, 1.0, 1.0)
-    simulation = TissueSimulation(mesh, material, none, stepping=euler, threads=3)
-    assert from_state(state_of(simulation)).dynamics._integrator._threads == 3  # type: ignore[attr-defined]
-    simulation.dynamics._integrator._threads = threads  # type: ignore[attr-defined]
-    with pytest.raises(StateError, match='_threads'):
+    active = ActiveSettings(mode)
+    made = TissueSimulation(
+        mesh, material, none, model=model, stepping=euler, active=active, threads=3
+    )
+    made.frame(indenter_contact(mesh, mesh.rest.max(axis=0), np.array([0.0, 0.0, -1.0]), 1e-3))
+    return made
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [('_threads', 1), ('_threads', 17), ('_threads', 10**9), ('_threads', 2.0), ('_threads', [2]),
+     ('min_nodes', 0)],
+)  # fmt: skip
+def test_a_recorded_state_starts_no_threads_that_a_scene_would_not(name: str, value: Any) -> None:
+    simulation = recorded()
+    integrator = from_state(state_of(simulation)).dynamics._integrator
+    assert isinstance(integrator, ParallelEuler) and integrator._threads == 3
+    setattr(simulation.dynamics._integrator, name, value)
+    with pytest.raises(StateError, match=name):
         from_state(state_of(simulation))
 
 
-def test_steps_that_threads_cannot_share_are_refused_unless_the_plan_chooses(
-    tmp_path: Path,
-) -> None:
+@pytest.mark.parametrize('spans', [[[-1_000_000, 0]], [[0, 1_000_000]], [0, 1]])
+def test_a_recorded_state_has_no_intervals_beyond_the_tissue(spans: list[Any]) -> None:
+    simulation = recorded('corotational', 'on')
+    region = simulation.dynamics._active._region  # type: ignore[union-attr]
+    assert region is not None
+    operands = region.operands._replace(spans=np.array(spans))
+    simulation.dynamics._active._region = region._replace(operands=operands)  # type: ignore[union-attr]
+    with pytest.raises(StateError, match='spans'):
+        from_state(state_of(simulation))
+
+
+def test_a_session_whose_steps_threads_cannot_share_is_computed_by_one(tmp_path: Path) -> None:
     changes = {'tissue.budget.cores': '2', 'tissue.integrator': 'rk4'}
-    for method in ('given', 'auto'):
-        scene = write_changed(load_scene('block'), tmp_path, changes | {'tissue.method': method})
-        if method == 'auto':
-            assert load_scene(str(scene)).tissue.budget.threads == 2
-            continue
-        with pytest.raises(
-            SceneError, match=r'symplectic_euler or euler, or set budget\.cores to 1'
-        ):
-            load_scene(str(scene))
+    scene = load_scene(str(write_changed(load_scene('block'), tmp_path, changes)))
+    simulation, _ = make_simulation(scene.tissue)
+    assert not simulation.dynamics.parallel
+    assert simulation.frame(None).substeps
 
 
 @pytest.mark.parametrize('cores', ['1.5', '0', '17', 'many'])

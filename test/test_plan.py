@@ -207,9 +207,7 @@ def test_a_method_whose_frames_in_a_cut_take_too_long_does_not_fit(
 ) -> None:
     task, _ = block_task()
 
-    def timed(
-        _: Task, simulation: TissueSimulation, contact: ToolContact | None
-    ) -> tuple[Frame, float]:
+    def timed(simulation: TissueSimulation, contact: ToolContact | None) -> tuple[Frame, float]:
         frame = simulation.frame(contact)
         return frame, 1e-3 if simulation.blade is None else 0.04
 

@@ -32,6 +32,7 @@ from cutting_trainer.tissue_sim.contact.tool import Frame
 from cutting_trainer.tissue_sim.mesh.pieces import PieceRegister
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.motion.far_field import SHARES
+from cutting_trainer.tissue_sim.motion.parallel_euler import PARALLEL, ParallelEuler
 from cutting_trainer.tissue_sim.planner.monitor import PlanMonitor
 from cutting_trainer.tissue_sim.scene_schema import TissueSettings
 from cutting_trainer.tissue_sim.simulation.checkpoint import Checkpoint, read_checkpoint
@@ -133,11 +134,18 @@ class TissueSimNode(ManagedNode):
             self.get_logger().warning(sentence)
 
     def _check_processors(self, threads: int) -> None:
+        """Say whether the cores of the scene's budget are used, and are there."""
         processors = len(os.sched_getaffinity(0))
-        if threads > processors:
+        if threads > 1 and not self._simulation.dynamics.parallel:
             self.get_logger().warning(
-                f'{threads} threads compute the tissue, as tissue.budget.cores says, on '
-                f'{processors} of the processors: frames take longer than planned'
+                f'tissue.budget.cores is {threads}, and one thread computes this tissue: several '
+                f'share only steps of {" and ".join(PARALLEL)}, from {ParallelEuler.min_nodes} '
+                'moving nodes on'
+            )
+        elif threads > processors:
+            self.get_logger().warning(
+                f'tissue.budget.cores is {threads}, and this node may use {processors} '
+                f'processors: frames take longer than with {threads}'
             )
 
     def _announce_method(self, taken: TissueSettings) -> None:

@@ -15,7 +15,6 @@ from cutting_trainer.tissue_sim.contact.tool_spring import ContactName
 from cutting_trainer.tissue_sim.elasticity.models import ModelName
 from cutting_trainer.tissue_sim.material_presets import PRESETS, PresetName
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
-from cutting_trainer.tissue_sim.motion.parallel_euler import PARALLEL
 from cutting_trainer.tissue_sim.planner.budget import Budget
 
 UNIT_SCALE = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
@@ -408,15 +407,6 @@ class TissueSettings(SceneModel):
             raise ValueError(
                 'integrator euler has no stable step without damping: set damping.beta above 0, '
                 'or take symplectic_euler'
-            )
-        return self
-
-    @model_validator(mode='after')
-    def _check_cores(self) -> Self:
-        if self.budget.threads > 1 and self.method == 'given' and self.integrator not in PARALLEL:
-            raise ValueError(
-                f'several threads cannot share the steps of {self.integrator}: take '
-                f'{" or ".join(PARALLEL)}, or set budget.cores to 1 at most'
             )
         return self
 

@@ -5,15 +5,14 @@ force evaluation takes 0.6 of the time. The operations exist in every processor'
 so the module is portable. Arrays are contiguous; indices are unsigned and not checked.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import config, types
-from numba.extending import intrinsic, models, register_model
+from numba import types
+from numba.extending import models, register_model
 
-from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.kernels import inner, operation
 
 _DOUBLE, _INT, _BYTE = ir.DoubleType(), ir.IntType(32), ir.IntType(8)
 _FOUR, _TWO = ir.VectorType(_DOUBLE, 4), ir.VectorType(_DOUBLE, 2)
@@ -71,16 +70,6 @@ def _picked(builder: Any, one: Any, other: Any, lanes: list[int]) -> Any:
     return builder.shuffle_vector(one, other, mask)
 
 
-def _operation(in_python: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an operation that kernels compile.
-
-    Args:
-        in_python: its Python version for NUMBA_DISABLE_JIT=1, for debugging; a vector is an array
-            there.
-    """
-    return (lambda _: in_python) if config.DISABLE_JIT else intrinsic
-
-
 def _four(values: np.ndarray, index: int) -> np.ndarray:
     return values[int(index) : int(index) + 4].copy()
 
@@ -97,7 +86,7 @@ def _add(values: np.ndarray, index: int, a: np.ndarray) -> None:
     values[int(index) : int(index) + 3] += a[:3]
 
 
-@_operation(_four)
+@operation(_four)
 def load_four(typing: Any, values: Any, index: Any) -> Any:
     """Return four consecutive numbers of an array; it must be long enough."""
 
@@ -108,7 +97,7 @@ def load_four(typing: Any, values: Any, index: Any) -> Any:
     return _VECTOR(values, index), generate
 
 
-@_operation(_three)
+@operation(_three)
 def load_three(typing: Any, values: Any, index: Any) -> Any:
     """Return three consecutive numbers of an array, and 0."""
 
@@ -118,7 +107,7 @@ def load_three(typing: Any, values: Any, index: Any) -> Any:
     return _VECTOR(values, index), generate
 
 
-@_operation(lambda x, y, z: np.array([x, y, z, 0.0]))
+@operation(lambda x, y, z: np.array([x, y, z, 0.0]))
 def three(typing: Any, x: Any, y: Any, z: Any) -> Any:
     """Return three numbers, and 0."""
 
@@ -131,7 +120,7 @@ def three(typing: Any, x: Any, y: Any, z: Any) -> Any:
     return _VECTOR(types.float64, types.float64, types.float64), generate
 
 
-@_operation(lambda x: np.full(4, x))
+@operation(lambda x: np.full(4, x))
 def spread(typing: Any, x: Any) -> Any:
     """Return one number in all lanes."""
 
@@ -143,7 +132,7 @@ def spread(typing: Any, x: Any) -> Any:
     return _VECTOR(types.float64), generate
 
 
-@_operation(np.multiply)
+@operation(np.multiply)
 def product(typing: Any, a: Any, b: Any) -> Any:
     """Return the product lane by lane."""
 
@@ -153,7 +142,7 @@ def product(typing: Any, a: Any, b: Any) -> Any:
     return _VECTOR(_VECTOR, _VECTOR), generate
 
 
-@_operation(lambda a, b, c: a + b * c)
+@operation(lambda a, b, c: a + b * c)
 def plus_product(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """Return lane by lane a + b c, rounded once where the processor can."""
 
@@ -164,7 +153,7 @@ def plus_product(typing: Any, a: Any, b: Any, c: Any) -> Any:
     return _VECTOR(_VECTOR, _VECTOR, _VECTOR), generate
 
 
-@_operation(lambda a: tuple(a[:3]))
+@operation(lambda a: tuple(a[:3]))
 def unpack(typing: Any, a: Any) -> Any:
     """Return the first three lanes, a tuple."""
 
@@ -175,7 +164,7 @@ def unpack(typing: Any, a: Any) -> Any:
     return types.UniTuple(types.float64, 3)(_VECTOR), generate
 
 
-@_operation(_put)
+@operation(_put)
 def put_three(typing: Any, values: Any, index: Any, a: Any) -> Any:
     """Store the first three lanes in an array, aligned as `add_three` expects."""
 
@@ -186,7 +175,7 @@ def put_three(typing: Any, values: Any, index: Any, a: Any) -> Any:
     return types.void(values, index, _VECTOR), generate
 
 
-@_operation(_add)
+@operation(_add)
 def add_three(typing: Any, values: Any, index: Any, a: Any) -> Any:
     """Add the first three lanes to consecutive numbers of an array."""
 
@@ -198,7 +187,7 @@ def add_three(typing: Any, values: Any, index: Any, a: Any) -> Any:
     return types.void(values, index, _VECTOR), generate
 
 
-@_operation(lambda values, index: None)
+@operation(lambda values, index: None)
 def prefetch(typing: Any, values: Any, index: Any) -> Any:
     """Prefetch an element of an array to the first cache; the index may be beyond the end."""
 

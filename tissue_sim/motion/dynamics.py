@@ -38,7 +38,7 @@ from cutting_trainer.tissue_sim.motion.far_field import SHARES, FarField
 from cutting_trainer.tissue_sim.motion.frame_motion import FrameMotion
 from cutting_trainer.tissue_sim.motion.loads import Loads
 from cutting_trainer.tissue_sim.motion.nodal_mass import NodalMass
-from cutting_trainer.tissue_sim.motion.parallel_euler import make_integrator
+from cutting_trainer.tissue_sim.motion.parallel_euler import ParallelEuler, make_integrator
 from cutting_trainer.tissue_sim.motion.stiffened_mass import SUBSTEPS_BETWEEN
 from cutting_trainer.tissue_sim.motion.time_steps import TimeStepping, TimeSteps
 
@@ -139,6 +139,13 @@ class Dynamics:
         """Let fewer nodes of a far field move on their own; see `FarField.concede`."""
         if self._far is not None:
             self._far.concede(steps)
+
+    @property
+    def parallel(self) -> bool:
+        """Whether several threads compute the steps in which all nodes move."""
+        return isinstance(self._integrator, ParallelEuler) and (
+            self.mesh.node_count >= self._integrator.min_nodes
+        )
 
     @property
     def active_nodes(self) -> int:

@@ -217,7 +217,7 @@ class _Team:
         self._threads = threads
         self._lock = Lock()
         self._others = ThreadPoolExecutor(threads - 1, 'frames')
-        self._of: tuple[Operands, Division] | None = None
+        self._known: tuple[Operands, np.ndarray, Division] | None = None
         self._forces = np.zeros((PARTS, 0))
 
     def steps(
@@ -229,31 +229,50 @@ class _Team:
         springs: Springs,
         faces: CutContacts,
         u: np.ndarray,
-        *rest: Any,
+        v: np.ndarray,
+        work: np.ndarray,
+        dt: float,
+        first: int,
+        steps: int,
+        total: int,
+        symplectic: bool,
     ) -> float:
         """Compute steps; return the work of the springs [J]. Arguments: see `euler_steps`."""
         with self._lock:
             if self._forces.shape[1] < len(u):
                 self._forces = np.zeros((PARTS, len(u)))
-            if self._of is None or operands is not self._of[0]:
-                self._of = operands, division_of(operands, spans, len(u) // 3)
-            division = self._of[1]
-            division.counters[:] = 0  # the law goes on as if nothing had been computed before
+            division = self._division(operands, spans, len(u) // 3)
             tools = len(springs.modes)
             account = Account(np.zeros((tools, 3)), np.zeros((tools, 2, 3)), np.zeros(1))
-            given: tuple[Any, ...] = (
-                *(self._threads, make_board(PARTS), operands, division, self._forces),
-                *(account, inverse_mass, damping, springs, faces, u, *rest),
+            self._run(
+                *(make_board(PARTS), operands, division, self._forces, account, inverse_mass),
+                *(damping, springs, faces, u, v, work, dt, first, steps, total, symplectic),
             )
-            others = [
-                self._others.submit(parallel_euler_steps, number, *given)
-                for number in range(1, self._threads)
-            ]
-            parallel_euler_steps(0, *given)
-            for other in others:
-                other.result()
-            *_, first, steps, total, _ = rest
             return float(end_of_work(springs, (first + steps) / total, u, account))
+
+    def _division(self, operands: Operands, spans: np.ndarray, count: int) -> Division:
+        """Return the division of a region, in which the law goes on as if from the beginning."""
+        known = self._known
+        if known is None or known[0] is not operands or known[1] is not spans:
+            known = self._known = operands, spans, division_of(operands, spans, count)
+        known[2].counters[:] = 0
+        return known[2]
+
+    def _run(self, *given: Any) -> None:
+        """Call the kernel in all threads; wait until the steps are computed."""
+        others = []
+        try:
+            for number in range(1, self._threads):
+                call = parallel_euler_steps, number, self._threads, *given
+                others.append(self._others.submit(*call))
+            parallel_euler_steps(0, self._threads, *given)
+        except BaseException:
+            for other in others:  # they compute all steps, also without the caller
+                if not other.cancel():
+                    other.result()
+            raise
+        for other in others:  # one that comes only now finds nothing to do: nobody waits for it
+            other.cancel()
 
 
 _team = cache(_Team)

@@ -9,21 +9,19 @@ call by which locks sleep: a thread that looked on might have the processor that
 import platform
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import config, types
+from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
-from cutting_trainer.node_common.kernels import inner
+from cutting_trainer.node_common.kernels import inner, operation
 
-_PHASE, _SLEEPERS, _DONE, _CLAIMS = 0, 8, 16, 24
+_LINE = 8
+_PHASE, _SLEEPERS, _DONE, _CLAIMS = 0, _LINE, 2 * _LINE, 3 * _LINE
 """Places on the board, each in a cache line of its own: number of the phase, threads that sleep,
 items done in the phase, and from there on the phase for which each item is free."""
-_LINE = 8
 _LOOKS = 3000
 """Looks at the board before a thread sleeps: 50 to 200 us, about the time to wake it up."""
 _INTEL = platform.machine() in ('x86_64', 'AMD64')
@@ -44,11 +42,6 @@ def make_board(items: int) -> np.ndarray:
     return np.zeros(_CLAIMS + _LINE * items, np.int64)
 
 
-def _operation(in_python: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an operation that kernels compile; with NUMBA_DISABLE_JIT=1 its Python version."""
-    return (lambda _: in_python) if config.DISABLE_JIT else intrinsic
-
-
 def _place(context: Any, builder: Any, signature: Any, given: Any) -> Any:
     """Return the pointer to a number of the board."""
     data = context.make_array(signature.args[0])(context, builder, given[0]).data
@@ -62,7 +55,7 @@ def _call_futex(builder: Any, place: Any, operation: int, value: Any) -> None:
     builder.call(call, [*numbers, *[ir.Constant(_LONG, 0)] * 3])
 
 
-@_operation(lambda board, index: int(board[index]))
+@operation(lambda board, index: int(board[index]))
 def _load(typing: Any, board: Any, index: Any) -> Any:
     """Return a number that other threads change."""
 
@@ -79,7 +72,7 @@ def _add_in_python(board: np.ndarray, index: int, value: int) -> int:
         return int(board[index]) - value
 
 
-@_operation(_add_in_python)
+@operation(_add_in_python)
 def _add(typing: Any, board: Any, index: Any, value: Any) -> Any:
     """Add to a number that other threads change; return its value before."""
 
@@ -97,7 +90,7 @@ def _change_in_python(board: np.ndarray, index: int, before: int, after: int) ->
         return changes
 
 
-@_operation(_change_in_python)
+@operation(_change_in_python)
 def _change(typing: Any, board: Any, index: Any, before: Any, after: Any) -> Any:
     """Change a number from one value to another; return False if another thread was first."""
 
@@ -109,7 +102,7 @@ def _change(typing: Any, board: Any, index: Any, before: Any, after: Any) -> Any
     return types.boolean(board, types.int64, types.int64, types.int64), generate
 
 
-@_operation(lambda board, index, value: time.sleep(1e-5))
+@operation(lambda board, index, value: time.sleep(1e-5))
 def _sleep(typing: Any, board: Any, index: Any, value: Any) -> Any:
     """Sleep if a number has a value, until it is woken."""
 
@@ -120,7 +113,7 @@ def _sleep(typing: Any, board: Any, index: Any, value: Any) -> Any:
     return types.none(board, types.int64, types.int64), generate
 
 
-@_operation(lambda board, index: None)
+@operation(lambda board, index: None)
 def _wake(typing: Any, board: Any, index: Any) -> Any:
     """Wake all threads that sleep at a number."""
 
@@ -132,7 +125,7 @@ def _wake(typing: Any, board: Any, index: Any) -> Any:
     return types.none(board, types.int64), generate
 
 
-@_operation(lambda: None)
+@operation(lambda: None)
 def _pause(typing: Any) -> Any:
     """Leave the processor's units to the other thread of its core for a moment."""
 

@@ -38,8 +38,8 @@ class Budget(SceneModel):
         default=0.5,
         gt=0,
         le=MAX_THREADS,
-        description='share of a core that the simulation may use, above 0 to 1; or how many cores, '
-        "2 to 64: so many threads compute a frame by Euler's methods, where they gain by it [-]",
+        description='share of a core that the simulation may use, or a whole number of cores: so '
+        f"many threads compute a large tissue by Euler's methods [-], above 0 to {MAX_THREADS}",
     )
 
     @field_validator('cores')

@@ -150,7 +150,6 @@ class _Timed:
             active=active,
             threads=task.budget.threads,
         )
-        self._task = task
         self._contacts = _in_and_out(task, indenter, depth)
         self._times: list[list[float]] = []
         self.substeps, self.step = 0, 0.0
@@ -160,7 +159,7 @@ class _Timed:
         for _ in range(repeats):
             times = []
             for contact in self._contacts:
-                frame, spent = _timed(self._task, self._simulation, contact)
+                frame, spent = _timed(self._simulation, contact)
                 times.append(spent)
             self._times.append(times[1:])
         needed = frame.substeps / max(frame.slow_motion, 1e-12)
@@ -185,11 +184,9 @@ def _in_and_out(task: Task, indenter: Indenter, depth: float) -> list[ToolContac
     return [indenter_contact(task.mesh, *place, share * depth, _COUPLING) for share in shares]
 
 
-def _timed(
-    task: Task, simulation: TissueSimulation, contact: ToolContact | None
-) -> tuple[Frame, float]:
+def _timed(simulation: TissueSimulation, contact: ToolContact | None) -> tuple[Frame, float]:
     """Return a frame, and its CPU time; of several threads its time, in which they wait too [s]."""
-    clock = time.thread_time if task.budget.threads == 1 else time.perf_counter
+    clock = time.perf_counter if simulation.dynamics.parallel else time.thread_time
     start = clock()
     frame = simulation.frame(contact)
     return frame, clock() - start
@@ -217,7 +214,7 @@ def with_blade(task: Task, candidate: Candidate) -> Candidate:
     )
     spent: list[float] = []
     for contact in _drawn(task):
-        frame, seconds = _timed(task, simulation, contact)
+        frame, seconds = _timed(simulation, contact)
         if frame.command is not None:
             simulation.cut_done()
         if simulation.blade is not None:
@@ -267,7 +264,6 @@ class _Strokes:
             active=active,
             threads=task.budget.threads,
         )
-        self._task = task
         indenter = places(task.mesh, task.budget.contact_radius, 1)[0]
         self._contacts = _in_and_out(task, indenter, depth)
         self._times: list[list[float]] = []
@@ -276,7 +272,7 @@ class _Strokes:
         """Return the displacement after each frame [m], shape (f, n, 3)."""
         times, seen = [], []
         for contact in [*self._contacts, *[None] * _FRAMES]:
-            times.append(_timed(self._task, self._simulation, contact)[1])
+            times.append(_timed(self._simulation, contact)[1])
             seen.append(self._simulation.displacement.copy())
         self._times.append(times[1:_FRAMES])
         return np.array(seen)

@@ -65,7 +65,8 @@ def _key(task: Task) -> str:
         total.update(f'{array.dtype} {array.shape}\n'.encode() + array.tobytes())
     parts = (task.material, task.resistance, task.budget, task.stepping, task.model)
     libraries = (code.kernels, code.python, code.numba, code.numpy, code.cpu, code.features)
-    total.update(repr((parts, libraries)).encode())
+    processors = min(task.budget.threads, len(os.sched_getaffinity(0)))
+    total.update(repr((parts, libraries, processors)).encode())
     return total.hexdigest()
 
 

@@ -294,7 +294,10 @@ def _check_estimates(simulation: TissueSimulation, n: int) -> None:
     has_room('_work', integrator._work, 7, *integrator._work.shape[1:])
     has_room('_damping', integrator._damping, 2)
     if isinstance(integrator, ParallelEuler):
-        within('_threads', [integrator._threads], MAX_THREADS + 1, 2)
+        has_room('_threads', np.array(integrator._threads)[None], 1)
+        within('_threads', integrator._threads, MAX_THREADS + 1, 2)
+        if 'min_nodes' in vars(integrator):
+            raise StateError('min_nodes is not to be chosen by a state')
 
 
 def _check_far_field(dynamics: Any, n: int) -> None:
@@ -370,7 +373,8 @@ def _check_operands(operands: Operands, size: int) -> None:
         within('nodes of rows', [len(rows.used)], size + 1)
     if len(operands.domains.used):
         _check_domains(operands.domains, len(operands.domains.used), limit)
-        within('spans', operands.spans, len(operands.domains.used) + 1)
+    has_room('spans', operands.spans, 0, 2)
+    within('spans', operands.spans, max(len(operands.domains.used), size) + 1)
     if len(operands.elements.corners):
         _check_elements(operands.elements, limit)
     if len(operands.law.domains):
