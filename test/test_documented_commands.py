@@ -152,6 +152,7 @@ ELSEWHERE: dict[str, Elsewhere | Script | Nowhere] = {
     'python -m bench.cuts.severance': Nowhere(
         'takes minutes: test_cutting_severance.py does it to fewer cuts'
     ),
+    'python -m bench.figures.scale_threads': Nowhere('it measures the speed of a quiet machine'),
     'python -m bench.haptics.random_cuts': Nowhere(
         'takes minutes: `bench.figures blade` does it to two strokes'
     ),
