@@ -5,6 +5,7 @@ order of the parts, and the nodes are moved. So the bits depend neither on the n
 processors nor on their load, but they are not those of `explicit.euler_steps`.
 """
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from threading import Lock
@@ -216,7 +217,7 @@ class _Team:
     def __init__(self, threads: int) -> None:
         self._threads = threads
         self._lock = Lock()
-        self._others = ThreadPoolExecutor(threads - 1, 'frames')
+        self._others = ThreadPoolExecutor(max(threads - 1, 1), 'frames')
         self._known: tuple[Operands, np.ndarray, Division] | None = None
         self._forces = np.zeros((PARTS, 0))
 
@@ -301,7 +302,9 @@ class ParallelEuler(Integrator):
         moving = int(np.sum(spans[:, 1] - spans[:, 0]))
         if moving < self.min_nodes or len(operands.local.first):
             return super()._euler(operands, spans, *rest)
-        return _team(self._threads).steps(operands, spans, *rest)
+        # On fewer processors so many threads are the fastest, with the same bits.
+        threads = min(self._threads, len(os.sched_getaffinity(0)))
+        return _team(threads).steps(operands, spans, *rest)
 
 
 def make_integrator(
