@@ -25,7 +25,7 @@ from cutting_trainer.tissue_sim.elasticity.material import Material
 from cutting_trainer.tissue_sim.elasticity.models import MODELS, ElasticModel, ModelName
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TetMesh
 from cutting_trainer.tissue_sim.motion.active_region import ActiveSettings
-from cutting_trainer.tissue_sim.motion.division import PARTS, Shared, division_of, shared_out
+from cutting_trainer.tissue_sim.motion.division import Shared, division_of, shared_out
 from cutting_trainer.tissue_sim.motion.dynamics import Dynamics
 from cutting_trainer.tissue_sim.motion.integrators import IntegratorName
 from cutting_trainer.tissue_sim.motion.parallel_euler import PARALLEL, ParallelEuler
@@ -43,6 +43,7 @@ ROUNDING = 1e-9
 def _small_meshes_are_shared() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ParallelEuler, 'min_nodes', 0)
+        patch.setattr('cutting_trainer.tissue_sim.motion.division._NODES_OF_PART', 8)
         yield
 
 
@@ -145,21 +146,23 @@ def test_each_row_domain_element_and_node_belongs_to_one_part() -> None:
 
 
 @given(
-    st.lists(st.tuples(st.integers(1, 5), st.integers(1, 90)), max_size=6), st.integers(0, 2**16)
+    st.lists(st.tuples(st.integers(1, 5), st.integers(1, 90)), max_size=6),
+    st.integers(1, 16),
+    st.integers(0, 2**16),
 )
 def test_intervals_are_shared_out_whole_and_evenly(
-    gaps_and_lengths: list[tuple[int, int]], seed: int
+    gaps_and_lengths: list[tuple[int, int]], parts: int, seed: int
 ) -> None:
     ends = np.cumsum(np.array(gaps_and_lengths, np.int64).reshape(-1)).reshape(-1, 2)
     size = int(ends[-1, 1]) if len(ends) else 0
     cost = np.random.default_rng(seed).integers(0, 20, size)
-    found = Shared(*shared_out(ends, cost))
+    found = Shared(*shared_out(ends, cost, parts))
     inside = listed(Shared(ends, np.zeros(0)))
     assert listed(found) == inside
     whole = sum(1 + int(cost[i]) for i in inside)
-    for part in range(PARTS):
+    for part in range(parts):
         own = listed(Shared(found.values[found.begins[part] : found.begins[part + 1]], ends))
-        assert sum(1 + int(cost[i]) for i in own) <= whole / PARTS + 20
+        assert sum(1 + int(cost[i]) for i in own) <= whole / parts + 20
 
 
 def cut_block(folder: Path, cores: str) -> tuple[int, np.ndarray]:

@@ -12,9 +12,9 @@ from cutting_trainer.node_common.kernels import inner, kernel
 from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands
 from cutting_trainer.tissue_sim.elasticity.rotation import LANES
 
-PARTS = 16
-"""Into which the work is divided, whatever the number of threads; so the bits do not depend on
-it."""
+MAX_PARTS, _NODES_OF_PART = 16, 800
+"""Parts into which the work is divided at most, and moving nodes for each: of smaller parts, most
+nodes belong to several. Their number does not depend on that of the threads, and so no bit does."""
 
 
 class Shared(NamedTuple):
@@ -22,7 +22,7 @@ class Shared(NamedTuple):
 
     Attributes:
         values: intervals or numbers.
-        begins: place of the first one of each part, and of the end, shape (PARTS + 1,).
+        begins: place of the first one of each of p parts, and of the end, shape (p + 1,).
     """
 
     values: np.ndarray
@@ -37,7 +37,7 @@ class Division(NamedTuple):
         reach: nodes that it reads and writes.
         moved: nodes that it moves, in intervals at each of which the same parts have forces.
         givers: of all nodes: which parts have forces there, as bits, shape (n,).
-        counters: those of the law, shape (PARTS, 2).
+        counters: those of the law, shape (p, 2).
         candidates: likewise, in as many places as the part has elements.
     """
 
@@ -57,14 +57,21 @@ def of_part(shared, part):
     return shared.values[shared.begins[part] : shared.begins[part + 1]]
 
 
+@inner
+def parts_of(division):
+    """Return the number of parts."""
+    return division.rows.begins.shape[0] - 1
+
+
 @kernel
-def shared_out(spans, cost):
+def shared_out(spans, cost, parts):
     """Divide intervals into parts that cost about the same.
 
     Args:
         spans: intervals, shape (s, 2).
         cost: of each index, 0 or more, to which 1 is added; there is nothing after the last, shape
             (n,).
+        parts: their number.
 
     Returns:
         Their intervals, shape (k, 2), and the first of each, see `Shared`.
@@ -73,12 +80,12 @@ def shared_out(spans, cost):
     for s in range(spans.shape[0]):
         for i in range(spans[s, 0], min(spans[s, 1], cost.shape[0])):
             total += 1.0 + cost[i]
-    out, begins = np.empty((spans.shape[0] + PARTS, 2), np.int64), np.zeros(PARTS + 1, np.int64)
+    out, begins = np.empty((spans.shape[0] + parts, 2), np.int64), np.zeros(parts + 1, np.int64)
     count, part, spent = 0, 0, 0.0
     for s in range(spans.shape[0]):
         for i in range(spans[s, 0], min(spans[s, 1], cost.shape[0])):
             starts = i == spans[s, 0]
-            while part < PARTS - 1 and spent * PARTS >= total * (part + 1):
+            while part < parts - 1 and spent * parts >= total * (part + 1):
                 part += 1
                 begins[part] = count
                 starts = True
@@ -95,7 +102,7 @@ def shared_out(spans, cost):
 def _reached(operands, rows, domains, chunks, count):
     """Return which parts have forces at each node or read it, as bits, shape (count,)."""
     out = np.zeros(count, np.int64)
-    for part in range(PARTS):
+    for part in range(rows.begins.shape[0] - 1):
         bit = np.int64(1) << part
         _mark_rows(operands.rows, of_part(rows, part), bit, out, True)
         _mark_rows(operands.domains, of_part(domains, part), bit, out, False)
@@ -116,20 +123,20 @@ def _mark_rows(rows, spans, bit, out, are_nodes):
 
 
 @kernel
-def _reach_of_parts(givers):
+def _reach_of_parts(givers, parts):
     """Return the intervals of nodes that each part reaches."""
-    begins, before = np.zeros(PARTS + 1, np.int64), np.int64(0)
+    begins, before = np.zeros(parts + 1, np.int64), np.int64(0)
     for here in givers:
         if here != before:
-            for part in range(PARTS):
+            for part in range(parts):
                 begins[part + 1] += (here & ~before) >> part & 1
         before = here
     begins[:] = np.cumsum(begins)
-    out, at, before = np.empty((begins[PARTS], 2), np.int64), begins[:PARTS].copy(), np.int64(0)
+    out, at, before = np.empty((begins[parts], 2), np.int64), begins[:parts].copy(), np.int64(0)
     for node in range(givers.shape[0] + 1):
         here = givers[node] if node < givers.shape[0] else np.int64(0)
         if here != before:
-            for part in range(PARTS):
+            for part in range(parts):
                 bit = np.int64(1) << part
                 if here & ~before & bit:
                     out[at[part], 0] = node
@@ -156,8 +163,8 @@ def _alike(moved, givers):
     nodes = 0
     for s in range(moved.values.shape[0]):
         nodes += moved.values[s, 1] - moved.values[s, 0]
-    out, begins, count = np.empty((nodes, 2), np.int64), np.zeros(PARTS + 1, np.int64), 0
-    for part in range(PARTS):
+    out, begins, count = np.empty((nodes, 2), np.int64), np.zeros_like(moved.begins), 0
+    for part in range(begins.shape[0] - 1):
         begins[part] = count
         spans = of_part(moved, part)
         for s in range(spans.shape[0]):
@@ -166,7 +173,7 @@ def _alike(moved, givers):
                     out[count, 0] = node
                     count += 1
                 out[count - 1, 1] = node + 1
-    begins[PARTS] = count
+    begins[-1] = count
     return out[:count].copy(), begins
 
 
@@ -178,21 +185,23 @@ def division_of(operands: Operands, spans: np.ndarray, count: int) -> Division:
         spans: intervals of moving nodes, shape (s, 2).
         count: of nodes, with coarse unknowns.
     """
-    rows = Shared(*shared_out(operands.awake, operands.rows.used))
-    domains = Shared(*shared_out(operands.spans, operands.domains.used))
+    moving = int(np.sum(spans[:, 1] - spans[:, 0]))
+    parts = min(max(moving // _NODES_OF_PART, 2), MAX_PARTS)
+    rows = Shared(*shared_out(operands.awake, operands.rows.used, parts))
+    domains = Shared(*shared_out(operands.spans, operands.domains.used, parts))
     # In the order of their nodes: then few parts have forces at the same ones.
     order = np.argsort(_places(operands.chunks, operands.elements.corners), kind='stable')
-    begins = len(order) * np.arange(PARTS + 1) // PARTS
+    begins = len(order) * np.arange(parts + 1) // parts
     chunks = Shared(operands.chunks[order], begins)
     givers = _reached(operands, rows, domains, chunks, count)
-    moved = Shared(*shared_out(spans, np.zeros(count, np.int64)))
+    moved = Shared(*shared_out(spans, np.zeros(count, np.int64), parts))
     return Division(
         rows,
         domains,
         chunks,
-        Shared(*_reach_of_parts(givers)),
+        Shared(*_reach_of_parts(givers, parts)),
         Shared(*_alike(moved, givers)),
         givers,
-        np.zeros((PARTS, 2), np.int64),
+        np.zeros((parts, 2), np.int64),
         np.zeros(len(operands.chunks) * LANES, np.int64),
     )

@@ -25,7 +25,13 @@ from cutting_trainer.tissue_sim.elasticity.adaptive_law import Law
 from cutting_trainer.tissue_sim.elasticity.coarse_rows import lead_far_nodes, put_coarse_forces
 from cutting_trainer.tissue_sim.elasticity.elastic_force import Operands, elastic_force
 from cutting_trainer.tissue_sim.elasticity.rotation import LANES
-from cutting_trainer.tissue_sim.motion.division import PARTS, Division, division_of, of_part
+from cutting_trainer.tissue_sim.motion.division import (
+    MAX_PARTS,
+    Division,
+    division_of,
+    of_part,
+    parts_of,
+)
 from cutting_trainer.tissue_sim.motion.explicit import (
     copy_nodes,
     look_ahead,
@@ -37,7 +43,7 @@ from cutting_trainer.tissue_sim.motion.phases import claim, finish, make_board, 
 
 PARALLEL: tuple[IntegratorName, ...] = ('symplectic_euler', 'euler')
 """Integrators that several threads share."""
-MAX_THREADS = PARTS
+MAX_THREADS = MAX_PARTS
 _BLOCK = 256
 """Nodes that are moved at once: their forces stay in the first cache."""
 _COPY, _AHEAD, _FAR, _FORCE, _PULL, _MOVE, _MEET = range(7)
@@ -152,21 +158,22 @@ def parallel_euler_steps(
         threads: their number.
         board: see `phases`.
         operands, division: of the region that moves.
-        forces: scratch: those of each part, shape (PARTS, 3 n).
+        forces: scratch: those of each part, shape (p, 3 n).
         account: of the springs, changed.
         inverse_mass, damping, springs, faces, u, v, work, dt, first, steps, total, symplectic: see
             `explicit.euler_steps`.
     """
     alpha, beta = damping[0], damping[1]
     q, external = work[2, : u.shape[0]], work[3, : u.shape[0]]
+    parts = parts_of(division)
     block, kinds = np.empty(3 * _BLOCK), _kinds(operands, springs, faces)
     phase = 0
     while phase < _FAR + steps * kinds.shape[0]:
         done, place = divmod(phase - _FAR, kinds.shape[0])
         kind = kinds[place] if phase >= _FAR else phase
-        items = 1 if kind == _FAR or kind == _PULL or kind == _MEET else PARTS
+        items = 1 if kind == _FAR or kind == _PULL or kind == _MEET else parts
         for turn in range(items):
-            item = (number * PARTS // threads + turn) % items  # first its own
+            item = (number * parts // threads + turn) % items  # first its own
             if not claim(board, phase, item):
                 continue
             if kind == _COPY:
@@ -219,7 +226,7 @@ class _Team:
         self._lock = Lock()
         self._others = ThreadPoolExecutor(max(threads - 1, 1), 'frames')
         self._known: tuple[Operands, np.ndarray, Division] | None = None
-        self._forces = np.zeros((PARTS, 0))
+        self._forces = np.zeros((MAX_PARTS, 0))
 
     def steps(
         self,
@@ -241,12 +248,12 @@ class _Team:
         """Compute steps; return the work of the springs [J]. Arguments: see `euler_steps`."""
         with self._lock:
             if self._forces.shape[1] < len(u):
-                self._forces = np.zeros((PARTS, len(u)))
+                self._forces = np.zeros((MAX_PARTS, len(u)))
             division = self._division(operands, spans, len(u) // 3)
             tools = len(springs.modes)
             account = Account(np.zeros((tools, 3)), np.zeros((tools, 2, 3)), np.zeros(1))
             self._run(
-                *(make_board(PARTS), operands, division, self._forces, account, inverse_mass),
+                *(make_board(MAX_PARTS), operands, division, self._forces, account, inverse_mass),
                 *(damping, springs, faces, u, v, work, dt, first, steps, total, symplectic),
             )
             return float(end_of_work(springs, (first + steps) / total, u, account))
@@ -292,7 +299,7 @@ class ParallelEuler(Integrator):
             the steps in less time, whatever the number of threads.
     """
 
-    min_nodes = 3000
+    min_nodes = 5000
 
     def __init__(self, name: IntegratorName, alpha: float, beta: float, threads: int) -> None:
         super().__init__(name, alpha, beta)
