@@ -28,7 +28,7 @@ _INTEL = platform.machine() in ('x86_64', 'AMD64')
 _FUTEX = 202 if _INTEL else 98
 """Number of the system call, on x86-64 or on ARM."""
 _WAIT, _WAKE = 128, 129
-"""Its operations, for the threads of one process."""
+"""Its commands, for the threads of one process."""
 _LONG = ir.IntType(64)
 _LOCK = threading.Lock()
 
@@ -48,10 +48,10 @@ def _place(context: Any, builder: Any, signature: Any, given: Any) -> Any:
     return builder.gep(data, [given[1]])
 
 
-def _call_futex(builder: Any, place: Any, operation: int, value: Any) -> None:
+def _call_futex(builder: Any, place: Any, command: int, value: Any) -> None:
     kind = ir.FunctionType(_LONG, [_LONG], var_arg=True)
     call = cgutils.get_or_insert_function(builder.module, kind, 'syscall')
-    numbers = [ir.Constant(_LONG, _FUTEX), place, ir.Constant(_LONG, operation), value]
+    numbers = [ir.Constant(_LONG, _FUTEX), place, ir.Constant(_LONG, command), value]
     builder.call(call, [*numbers, *[ir.Constant(_LONG, 0)] * 3])
 
 

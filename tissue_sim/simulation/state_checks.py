@@ -374,7 +374,7 @@ def _check_operands(operands: Operands, size: int) -> None:
     if len(operands.domains.used):
         _check_domains(operands.domains, len(operands.domains.used), limit)
     has_room('spans', operands.spans, 0, 2)
-    within('spans', operands.spans, max(len(operands.domains.used), size) + 1)
+    within('spans', operands.spans, (len(operands.domains.used) or size) + 1)
     if len(operands.elements.corners):
         _check_elements(operands.elements, limit)
     if len(operands.law.domains):
