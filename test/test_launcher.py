@@ -150,6 +150,7 @@ COMPLETE = {
     'version': [3, 12, 1],
     'executable': '/usr/bin/python3.12',
     'venv': True,
+    'pip': '/usr/share/python-wheels/pip-24.0-py3-none-any.whl',
     'headers': True,
     'include': '/usr/include/python3.12',
 }
@@ -218,7 +219,6 @@ def test_missing_build_tool_is_named_before_anything_is_downloaded(
     [
         ('packages', 'NewConnectionError: [Errno -2]', 15, 'Connect'),
         ('packages', 'OSError: [Errno 28] No space left on device', 16, 'Make room'),
-        ('environment', 'because ensurepip is not available', 11, 'python3-venv'),
         ('interfaces', 'ninja: build stopped', 17, 'interfaces.log'),
     ],
 )
