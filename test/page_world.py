@@ -22,13 +22,13 @@ from cutting_trainer.viewer.access_control import Gate, link
 from cutting_trainer.viewer.allowed_requests import LiveControls, ReplayControls
 from cutting_trainer.viewer.appearance import (
     FLOOR,
+    OTHER_TISSUE,
     camera,
     reach,
     shown_exercise,
     shown_tissue,
     tool_shape,
 )
-from cutting_trainer.viewer.colours import OTHER_TISSUE
 from cutting_trainer.viewer.drawn_surface import CUT, TissueSource
 from cutting_trainer.viewer.live_page import OWN_TISSUE
 from cutting_trainer.viewer.page_protocol import (

@@ -25,8 +25,7 @@ from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.tissue_sim.streaming.messages import mesh_message
 from cutting_trainer.viewer import tf_frames
 from cutting_trainer.viewer.appearance import METRES_PER_NEWTON, blade, handle
-from cutting_trainer.viewer.colours import CUT
-from cutting_trainer.viewer.markers import Colouring, Markers, shades, von_mises
+from cutting_trainer.viewer.markers import CUT_COLOUR, Colouring, Markers, shades, von_mises
 from cutting_trainer.viewer.tf_frames import StaticFrames, device_frame, publishing_command
 from cutting_trainer.viewer.tool_state import Moment
 
@@ -108,7 +107,7 @@ def test_cut_surface_has_one_colour_of_its_own(replica, moment):
     markers = decoded(replica, moment)
     assert not markers['cut'].colors and len(markers['cut'].points) > 0
     cut = markers['cut'].color
-    assert (cut.r, cut.g, cut.b, cut.a) == pytest.approx((*(c / 255 for c in CUT), 1))
+    assert (cut.r, cut.g, cut.b, cut.a) == pytest.approx(CUT_COLOUR)
 
 
 def test_every_marker_is_in_the_frame_of_the_tissue_and_of_one_time(replica, moment):

@@ -8,10 +8,15 @@ from numpy.typing import NDArray
 from cutting_trainer.exercises.scene_schema import BallSettings, ExerciseSettings
 from cutting_trainer.haptic_bridge.scene_schema import ToolSettings
 from cutting_trainer.viewer.allowed_requests import Bounds
-from cutting_trainer.viewer.colours import TISSUE, Colour
 from cutting_trainer.viewer.tool_state import Floats, Moment
 
 Indices = NDArray[np.int64]
+Colour = tuple[int, int, int]
+"""Red, green, blue, 0 to 255. Those of the cut and of the tools are in `static/colours.js`."""
+
+TISSUE: Colour = (205, 118, 100)
+OTHER_TISSUE: Colour = (120, 140, 190)
+"""A tissue that is computed again, beside the recorded one."""
 
 METRES_PER_NEWTON = 0.02
 """[m/N] Length of the force's arrow."""

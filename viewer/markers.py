@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from cutting_trainer.tissue_sim.mesh.replica import MeshReplica
 from cutting_trainer.viewer.appearance import arrow
-from cutting_trainer.viewer.colours import CUT
 from cutting_trainer.viewer.tool_state import Floats, Moment
 
 Colouring = Literal['displacement', 'von_mises']
@@ -21,7 +20,7 @@ ADD, DELETE = 0, 2
 """Constants of `visualization_msgs/Marker`."""
 _SHADES = np.asarray(mpl.colormaps['viridis'](np.linspace(0, 1, 256)), np.float32)
 _PLAIN = (1.0, 1.0, 1.0, 1.0)
-_CUT_COLOUR = (*(c / 255 for c in CUT), 1.0)
+CUT_COLOUR = (120 / 255, 8 / 255, 22 / 255, 1.0)
 _BLADE, _PROXY, _FORCE = (0.45, 0.5, 0.58, 1.0), (0.16, 0.59, 0.35, 0.6), (0.12, 0.35, 0.86, 1.0)
 _BLADE_WIDTH, _SHAFT, _HEAD = 0.0012, 0.0016, 0.0044
 
@@ -105,7 +104,7 @@ class Markers:
         self._marker(
             out, stamp, 'tissue', TRIANGLE_LIST, one, _PLAIN, positions[outer], colours[outer]
         )
-        self._marker(out, stamp, 'cut', TRIANGLE_LIST, one, _CUT_COLOUR, positions[opened])
+        self._marker(out, stamp, 'cut', TRIANGLE_LIST, one, CUT_COLOUR, positions[opened])
         if moment is not None:
             self._tool(out, stamp, moment, radius)
         return out.data()

@@ -11,13 +11,14 @@ from cutting_trainer.viewer.allowed_requests import ReplayControls
 from cutting_trainer.viewer.appearance import (
     FLOOR,
     METRES_PER_NEWTON,
+    OTHER_TISSUE,
+    TISSUE,
     TISSUE_SPACING,
     camera,
     shown_exercise,
     shown_tissue,
     tool_shape,
 )
-from cutting_trainer.viewer.colours import OTHER_TISSUE, TISSUE
 from cutting_trainer.viewer.drawn_surface import TissueSource
 from cutting_trainer.viewer.live_page import put_moment
 from cutting_trainer.viewer.page_protocol import VERSION, AnyMessage, Play, Seek, Speed

@@ -1,4 +1,4 @@
-// Colours of what is drawn; the page sends those of the tissues' outside (viewer/colours.py).
+// Colours of what is drawn; the page sends those of the tissues' outside (viewer/appearance.py).
 
 // Cut
 export const OPENED = 0xa30a18; // cut faces, deep inside
