@@ -10,7 +10,6 @@ from numba import config, njit
 from numba.extending import intrinsic, overload, register_jitable
 from numba.np import arrayobj
 
-from cutting_trainer.node_common.compiler_shortcuts import take_shortcuts
 from cutting_trainer.node_common.linked_code import link_inner_functions
 
 _OPTIONS = {'no_cfunc_wrapper': True}
@@ -53,4 +52,3 @@ def _raise_in_kernel(source: Any, target: Any) -> Callable[..., None]:
 # which the force loop is compiled.
 arrayobj.raise_with_shape_context = _raise_for_shape
 link_inner_functions()
-take_shortcuts()

@@ -34,6 +34,9 @@ def start_worker() -> None:
 
     To take the compiler's memory apart would last four seconds.
     """
+    from cutting_trainer.session.compiler_shortcuts import take_shortcuts
+
+    take_shortcuts()
     share_cache()
     atexit.register(os._exit, 0)
 

@@ -491,6 +491,17 @@ def test_python_of_an_environment_stands_for_the_one_that_it_was_made_of(
     assert not Path(facts['executable']).is_relative_to(tmp_path)
 
 
+def test_the_wheel_that_an_interpreter_carries_is_a_pip_that_runs(
+    launcher: Any, tmp_path: Path
+) -> None:
+    wheel = launcher.probe(sys.executable)['pip']
+    python = [sys.executable, '-m']
+    subprocess.run([*python, 'zipfile', '-e', wheel, tmp_path], check=True)
+    environment = os.environ | {'PYTHONPATH': str(tmp_path)}
+    said = subprocess.check_output([*python, 'pip', '--version'], env=environment, text=True)
+    assert f'from {tmp_path}' in said
+
+
 def test_messages_are_built_once_for_all_clones(
     launcher: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

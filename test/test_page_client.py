@@ -44,7 +44,7 @@ WHAT_IS_THERE = """(() => {
 
 @pytest.fixture(scope='module')
 def browser() -> Iterator[Browser]:
-    with chromium((1000, 700)) as browser:
+    with chromium((1000, 700), coarseness=2) as browser:
         yield browser
 
 

@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(scope='module')
 def browser() -> Iterator[Browser]:
-    with chromium((1000, 700)) as browser:
+    with chromium((1000, 700), coarseness=2) as browser:
         yield browser
 
 

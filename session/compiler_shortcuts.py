@@ -1,7 +1,8 @@
-"""Shortcuts through Numba's compiler: it makes the same code in three quarters of the time.
+"""Shortcuts through Numba's compiler, for processes that compile the trainer's kernels and end.
 
-By itself it tries all variants of a function at each call, several times, and writes a sentence
-about each that does not fit. The parts of Numba that are replaced are those of the locked version.
+Numba tries all variants of a function at each call, several times, and writes a sentence about each
+that does not fit. With these shortcuts it makes the same code in three quarters of the time. The
+parts of Numba that are replaced are those of the locked version.
 """
 
 from collections.abc import Callable, Iterable
@@ -18,16 +19,17 @@ _known: dict[Any, tuple[Any, Any]] = {}
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return the signature of a call, and put its implementation in place, see Numba's own."""
+    """Return the signature of a call, and put its implementation in place, as Numba's own."""
     settings = ConfigStack.top_or_none()
     call = self, context, tuple(args), tuple(kws.items())
     known = _known.get((*call, settings))
-    if known is None:
-        signature: Any = _resolve(self, context, args, kws)
-        known = signature, self._impl_keys[signature.args]
-        _known[*call, settings and settings.copy()] = known  # the compiler changes its own
-    signature, self._impl_keys[signature.args] = known
-    return signature
+    if known:
+        signature, implementation = known
+        self._impl_keys[signature.args] = implementation
+        return signature
+    new: Any = _resolve(self, context, args, kws)
+    _known[*call, settings and settings.copy()] = new, self._impl_keys[new.args]
+    return new
 
 
 @cache
@@ -35,17 +37,18 @@ def _hash_of_class(kind: Any) -> int:
     return hash(tuple(sorted(kind.options)))
 
 
-def _hash_settings(self: Any) -> int:
+def _hash_settings(self: TargetConfig) -> int:
     """Return the hash of settings: in Numba, too, it depends on their names alone."""
     kind: Any = type(self)
     return _hash_of_class(kind)
 
 
 def _equal_settings(self: TargetConfig, other: object) -> bool:
-    """Return whether settings are equal; most often those are that were given, without defaults."""
+    """Return whether settings are equal; defaults are looked at only where given values differ."""
     if not isinstance(other, TargetConfig):
         return NotImplemented
-    return bool(self._values == other._values or self.values() == other.values())
+    alike = type(self) is type(other) and self._values == other._values
+    return bool(alike or self.values() == other.values())
 
 
 @cache
@@ -75,17 +78,20 @@ def _variables(_: ir.Inst, value: Any) -> list[ir.Var]:
 
 
 def _tell_nobody(_: event.Event) -> None:
-    """Leave out the clocks of the compiler: each of a kernel would time all it calls."""
+    """Tell no listener: the clock of each function would get all events of those that it calls."""
+
+
+SHORTCUTS: dict[Any, dict[str, Any]] = {
+    BaseFunction: {'get_call_type': _call_type},
+    TargetConfig: {'__hash__': _hash_settings, '__eq__': _equal_settings},
+    ir.Inst: {'_rec_list_vars': _variables},
+    event: {'broadcast': _tell_nobody},
+}
+"""Replaced functions by class or module of Numba."""
 
 
 def take_shortcuts() -> None:
-    """Let Numba compile in less time."""
-    replaced: dict[Any, dict[str, Any]] = {
-        BaseFunction: {'get_call_type': _call_type},
-        TargetConfig: {'__hash__': _hash_settings, '__eq__': _equal_settings},
-        ir.Inst: {'_rec_list_vars': _variables},
-        event: {'broadcast': _tell_nobody},
-    }
-    for owner, functions in replaced.items():
+    """Let Numba compile in less time, in this process."""
+    for owner, functions in SHORTCUTS.items():
         for name, function in functions.items():
             setattr(owner, name, function)
