@@ -49,7 +49,7 @@ def report(scene: str, settings: TissueSettings, found: Plan) -> list[str]:
         f'{scene}: {found.tetrahedra} tetrahedra, {"cut" if b.cuts else "not cut"}',
         f'  asked: up to {1e3 * b.displacement:g} mm and {b.rotation:g} degrees, error at most '
         f'{100 * b.error:g} %, {ms(found.available)} a frame at {settings.integration.rate:g} Hz '
-        f'({b.cores:g} cores)',
+        f'(cores: {b.cores:g})',
     ]
     if found.chosen is not None:
         lines += _chosen(found.chosen, found)

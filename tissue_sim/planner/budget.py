@@ -38,8 +38,9 @@ class Budget(SceneModel):
         default=0.5,
         gt=0,
         le=MAX_THREADS,
-        description='share of a core that the simulation may use, or a whole number of cores: so '
-        f"many threads compute a large tissue by Euler's methods [-], above 0 to {MAX_THREADS}",
+        description='share of a core that the simulation may use, up to 1, or a number of threads '
+        "that compute a tissue of which 5,000 nodes or more move, by Euler's methods [-], "
+        f'above 0 to {MAX_THREADS}',
     )
 
     @field_validator('cores')
@@ -47,7 +48,8 @@ class Budget(SceneModel):
     def _check_whole(cls, cores: float) -> float:
         if cores > 1 and cores != int(cores):
             raise ValueError(
-                f'{cores:g} is neither a share of a core, up to 1, nor a whole number of cores'
+                f'{cores:g} is neither a share of a core, up to 1, nor a whole number of cores: '
+                'write 1 or 2'
             )
         return cores
 
