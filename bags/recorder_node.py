@@ -47,7 +47,8 @@ from cutting_trainer.node_common.timing import request_preference
 
 _POLL_PERIOD_S = 0.02
 """[s] between two polls of all topics, whose queues hold a second of a 1 kHz stream."""
-_NICENESS = -5
+_NICENESS = -12
+"""Before the tissue: a frame can come later, and a message that is not taken in time is lost."""
 _DISCOVERY_PERIOD_S = 0.02
 _REVIEW_PERIOD_S = 1.0
 _FLUSH_PERIOD_S = 0.2

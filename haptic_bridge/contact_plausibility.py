@@ -74,9 +74,10 @@ def share_within(surface: Geometry, blade: np.ndarray, work: np.ndarray) -> floa
     The simulation's last word is some frames old. A blade that is drawn out fast has left the
     surface by then, and must not be held any more. Arguments as of `accepts`.
     """
-    if _is_under(surface, blade, work):
+    # Nearly always the blade meets the surface somewhere, and one look nearby is enough.
+    if _is_near(surface, blade, _REACHES_M[0], work) or _is_under(surface, blade, work):
         return 1.0
-    for beyond in range(len(_REACHES_M)):
+    for beyond in range(1, len(_REACHES_M)):
         if _is_near(surface, blade, _REACHES_M[beyond], work):
             return 1.0 - beyond / len(_REACHES_M)
     return 0.0
