@@ -32,17 +32,19 @@ class Places(NamedTuple):
     Attributes:
         processes: of all threads.
         receivers: of those threads in which DDS receives, where they have others.
+        remark: sentence about too few processors, or ''.
     """
 
     processes: dict[Work, set[int]]
     receivers: dict[Work, set[int]]
+    remark: str = ''
 
 
 ANYWHERE = Places({}, {})
 
 
 def shared_out(work: Sequence[Work], processors: Sequence[int]) -> Places:
-    """Return the processors by work; `ANYWHERE` where they are too few.
+    """Return the processors by work; anywhere where they are too few.
 
     Frames get processors of their own. Where too few are left for all loops, the arms are on those
     of the frames, and the recorder receives anywhere: of two tools on two processors, 29 of 600
@@ -55,20 +57,32 @@ def shared_out(work: Sequence[Work], processors: Sequence[int]) -> Places:
     arms, bridges = work.count('arm'), work.count('bridge')
     apart, together = _processors_for(arms + bridges), _processors_for(bridges)
     count = apart if apart < len(processors) else together
-    if 'frames' not in work or not 0 < count < len(processors):
+    if 'frames' not in work or not count:
         return ANYWHERE
+    remark = '' if apart < len(processors) else _too_few(arms + bridges, apart + 1, processors)
+    if count >= len(processors):
+        return ANYWHERE._replace(remark=remark)
     frames, loops = set(processors[:-count]), set(processors[-count:])
     crowded = count < apart
     if crowded and _processors_for(arms) > len(frames):
-        return ANYWHERE
+        return ANYWHERE._replace(remark=remark)
     return Places(
         {'frames': frames, 'bridge': loops, 'arm': frames if crowded else loops},
         {'frames': loops, 'arm': loops, 'messages': set(processors) if crowded else loops},
+        remark,
     )
 
 
 def _processors_for(loops: int) -> int:
     return -(-loops // LOOPS_PER_PROCESSOR)
+
+
+def _too_few(loops: int, needed: int, processors: Sequence[int]) -> str:
+    there = len(processors)
+    return (
+        f'{loops} force loops and the tissue need {needed} processors of their own, and this '
+        f'session has {there}: the tissue may run slower than its rate'
+    )
 
 
 def place(pid: int, processors: set[int]) -> None:
@@ -100,5 +114,5 @@ def reserved_processors(work: Sequence[Work]) -> Iterator[Places]:
             if found.processes:
                 reservation.bind(_ADDRESS)
         except OSError:
-            found = ANYWHERE
+            found = ANYWHERE._replace(remark=found.remark)
         yield found

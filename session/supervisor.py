@@ -114,6 +114,8 @@ class Supervisor:
         self._held.enter_context(preferred_group())
         work = [command.work for command in self._commands]
         self._places = self._held.enter_context(reserved_processors(work))
+        if self._places.remark:
+            self._emit(Event('warning', 'session', self._places.remark))
         return self
 
     def __exit__(self, *_: object) -> None:

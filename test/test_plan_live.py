@@ -27,10 +27,13 @@ from cutting_trainer.recordings.resimulate_command import pose_check, recomputat
 from cutting_trainer.session.domain import reserved_domain
 from cutting_trainer.session.node_commands import node_environment
 from cutting_trainer.session.scene_loader import load_scene
-from cutting_trainer.tissue_sim.assembly import make_plan, make_task
+from cutting_trainer.tissue_sim.assembly import make_task
 from cutting_trainer.tissue_sim.contact.tool import ContactState, ToolContact, indenter_contact
 from cutting_trainer.tissue_sim.mesh.tetra_mesh import TopologyDelta
+from cutting_trainer.tissue_sim.planner.memory import remember
+from cutting_trainer.tissue_sim.planner.plan import plan
 from cutting_trainer.tissue_sim.streaming.messages import delta_into
+from cutting_trainer.tissue_sim.warm_up import warm_up
 
 pytestmark = pytest.mark.long
 
@@ -61,6 +64,23 @@ def planning_scene(folder: Path, **budget: Any) -> Path:
     with path.open('w') as file:
         YAML().dump(scene, file)
     return path
+
+
+def fitting_scene(folder: Path) -> Path:
+    """The scene with a share of a core that is enough before the cut, and its plan for the node.
+
+    On a shared machine a frame costs half as much again in one second as in another.
+    """
+    warm_up()
+    for _ in range(20):
+        whole = plan(make_task(load_scene(str(planning_scene(folder, cores=1.0))).tissue))
+        assert whole.chosen is not None
+        scene = planning_scene(folder, cores=ROOM * 30.0 * whole.chosen.cost.frame)
+        task = make_task(load_scene(str(scene)).tissue)
+        if (found := plan(task)).chosen is not None:
+            remember(task, found)
+            return scene
+    raise AssertionError('a frame never cost the same twice within a half')
 
 
 class Surroundings:
@@ -195,10 +215,7 @@ def run(tmp_path: Path, domain: int) -> Iterator[Any]:
 def test_a_node_that_plans_says_what_it_takes_and_warns_when_a_cut_breaks_the_budget(
     run: Any, tmp_path: Path
 ) -> None:
-    found = make_plan(make_task(load_scene(str(planning_scene(tmp_path, cores=1.0))).tissue))
-    assert found.chosen is not None
-    share = ROOM * 30.0 * found.chosen.cost.frame
-    surroundings, log = run(planning_scene(tmp_path, cores=share))
+    surroundings, log = run(fitting_scene(tmp_path))
     wait_for(lambda: 'method: linear_smoothed by ' in log.read_text(), 'the method in the log')
     said = log.read_text()
     assert '103 % by elements of this size, 12 % by the footprint of the tool; 90 %' in said

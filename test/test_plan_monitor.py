@@ -82,3 +82,17 @@ def test_a_plan_of_an_earlier_start_is_taken_and_a_new_one_kept(
     assert done == ['load', 'measure'], 'what is loaded meanwhile would count as cost'
     known[0] = replace(PLAN, available=0.01)
     assert assembly.make_plan(task) is known[0] and kept == [PLAN]
+
+
+def test_a_plan_that_nothing_fits_is_made_anew_at_the_next_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kept: list[Plan] = []
+    made = [PLAN, replace(PLAN, chosen=None)]
+    monkeypatch.setattr(assembly, 'recall', lambda *_: None)
+    monkeypatch.setattr(assembly, 'remember', lambda _, found: kept.append(found))
+    monkeypatch.setattr(assembly, 'plan', lambda *_: made.pop())
+    monkeypatch.setattr(assembly, 'warm_up', lambda: None)
+    task: Any = None
+    assert assembly.make_plan(task).chosen is None and not kept, 'the machine may have been busy'
+    assert assembly.make_plan(task) is PLAN and kept == [PLAN]

@@ -60,7 +60,7 @@ def test_two_force_loops_share_a_processor_and_frames_get_the_others(
 ) -> None:
     processes = {'bridge': loops, 'arm': loops, 'frames': frames}
     receivers = dict.fromkeys(('arm', 'messages', 'frames'), loops)
-    assert shared_out(work, available) == (processes, receivers)
+    assert shared_out(work, available) == (processes, receivers, '')
 
 
 @pytest.mark.parametrize(
@@ -71,6 +71,9 @@ def test_arms_go_to_the_frames_where_too_few_processors_are_left(
 ) -> None:
     found = shared_out(tools * ['arm', 'bridge'] + ['frames'], available)
     assert found.processes.get('arm') == arms
+    needed, there = tools + 1, len(available)
+    said = f'{2 * tools} force loops and the tissue need {needed} processors of their own, and '
+    assert found.remark.startswith(f'{said}this session has {there}: the tissue may run slower')
     if arms is not None:
         bridges = set(available) - arms
         assert found.processes['frames'] == arms and found.processes['bridge'] == bridges

@@ -114,7 +114,9 @@ def make_plan(
     note: Callable[[str], None] = lambda text: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Plan:
-    """Return the plan for a scene: that of an earlier start, or a new one, which is kept.
+    """Return the plan for a scene: that of an earlier start, or a new one.
+
+    One by which something fits is kept. Where nothing does, the machine may have been busy.
 
     Args:
         task: the scene.
@@ -126,7 +128,8 @@ def make_plan(
         return known
     warm_up()  # a kernel that is loaded meanwhile would count as cost
     found = plan(task, say)
-    remember(task, found)
+    if found.chosen is not None:
+        remember(task, found)
     return found
 
 
