@@ -202,6 +202,21 @@ def test_jaws_keep_what_they_press_down_however_hard() -> None:
     assert rest_under(simulation, grasper(deep, closed=True)).state == ContactState.INSIDE
 
 
+def test_jaws_of_which_nothing_is_known_any_more_let_go_for_good() -> None:
+    simulation = block()
+    over = at_node(simulation, 0.03, 0.015, TOP - 1e-3)
+    simulation.frame(grasper(over, closed=False))
+    lifted = grasper(replace(over, device=over.device + 4e-3 * UP), closed=True)
+    lifted = replace(lifted, state=ContactState.NONE)
+    simulation.frame(grasper(over, closed=True))
+    assert simulation.frame(lifted).state == ContactState.INSIDE
+    assert simulation.frame(None).state == ContactState.NONE
+    # A bridge that comes back with closed jaws pulls at nothing, wherever they are by then.
+    back = simulation.frame(lifted)
+    assert back.state == ContactState.NONE
+    assert not back.force.any()
+
+
 def test_a_grip_follows_its_nodes_when_others_are_removed() -> None:
     simulation = block()
     mesh = simulation.mesh

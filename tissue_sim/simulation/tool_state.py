@@ -119,7 +119,7 @@ class ToolState:
         """
         edge, self._edge = self._edge, None
         if contact is None:
-            self._target = None
+            self._target = self._grip = None
             if self.blade is not None:
                 self.blade.let_go()
             return None
