@@ -78,10 +78,10 @@ def _processors_for(loops: int) -> int:
 
 
 def _too_few(loops: int, needed: int, processors: Sequence[int]) -> str:
-    there = len(processors)
+    what, there = '1 force loop' if loops == 1 else f'{loops} force loops', len(processors)
     return (
-        f'{loops} force loops and the tissue need {needed} processors of their own, and this '
-        f'session has {there}: the tissue may run slower than its rate'
+        f'{what} and the tissue need {needed} processors, and this session has {there}: on slow '
+        'ones frames come late, and messages may be lost. Take more processors, or fewer tools'
     )
 
 

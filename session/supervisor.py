@@ -114,8 +114,6 @@ class Supervisor:
         self._held.enter_context(preferred_group())
         work = [command.work for command in self._commands]
         self._places = self._held.enter_context(reserved_processors(work))
-        if self._places.remark:
-            self._emit(Event('warning', 'session', self._places.remark))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -141,6 +139,8 @@ class Supervisor:
         Returns:
                 Whether all are ready; if not, the outcome has the reason.
         """
+        if self._places.remark:
+            self._emit(Event('warning', 'session', self._places.remark))
         if not self._start_all(self._commands, timeout):
             return False
         self._began = time.monotonic()

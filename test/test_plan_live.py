@@ -218,6 +218,7 @@ def test_a_node_that_plans_says_what_it_takes_and_warns_when_a_cut_breaks_the_bu
     surroundings, log = run(fitting_scene(tmp_path))
     wait_for(lambda: 'method: linear_smoothed by ' in log.read_text(), 'the method in the log')
     said = log.read_text()
+    assert 'planned anew' not in said
     assert '103 % by elements of this size, 12 % by the footprint of the tool; 90 %' in said
     wait_for(lambda: 'substeps' in surroundings.values(), 'a frame')
     values = surroundings.values()

@@ -84,15 +84,17 @@ def test_a_plan_of_an_earlier_start_is_taken_and_a_new_one_kept(
     assert assembly.make_plan(task) is known[0] and kept == [PLAN]
 
 
-def test_a_plan_that_nothing_fits_is_made_anew_at_the_next_start(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ('late', 'goes_on', 'anew'), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_plan_whose_methods_take_too_long_is_made_anew_but_by_a_session_that_goes_on(
+    monkeypatch: pytest.MonkeyPatch, late: bool, goes_on: bool, anew: bool
 ) -> None:
-    kept: list[Plan] = []
-    made = [PLAN, replace(PLAN, chosen=None)]
-    monkeypatch.setattr(assembly, 'recall', lambda *_: None)
+    known, kept = replace(PLAN, chosen=None, late=late), []
+    monkeypatch.setattr(assembly, 'recall', lambda *_: known)
     monkeypatch.setattr(assembly, 'remember', lambda _, found: kept.append(found))
-    monkeypatch.setattr(assembly, 'plan', lambda *_: made.pop())
+    monkeypatch.setattr(assembly, 'plan', lambda *_: PLAN)
     monkeypatch.setattr(assembly, 'warm_up', lambda: None)
     task: Any = None
-    assert assembly.make_plan(task).chosen is None and not kept, 'the machine may have been busy'
-    assert assembly.make_plan(task) is PLAN and kept == [PLAN]
+    assert assembly.make_plan(task, goes_on=goes_on) is (PLAN if anew else known)
+    assert kept == [PLAN] * anew

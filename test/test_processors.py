@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_supervisor import ENVIRONMENT, Ledger, command
 
-from cutting_trainer.session import processors
+from cutting_trainer.session import processors, supervisor
 from cutting_trainer.session.node_commands import session_nodes
 from cutting_trainer.session.node_process import NodeCommand
 from cutting_trainer.session.processors import ANYWHERE, Work, reserved_processors, shared_out
-from cutting_trainer.session.supervisor import Supervisor
+from cutting_trainer.session.supervisor import Event, Supervisor
 
 KINDS: dict[str, Work] = {
     'arm': 'arm',
@@ -72,8 +73,8 @@ def test_arms_go_to_the_frames_where_too_few_processors_are_left(
     found = shared_out(tools * ['arm', 'bridge'] + ['frames'], available)
     assert found.processes.get('arm') == arms
     needed, there = tools + 1, len(available)
-    said = f'{2 * tools} force loops and the tissue need {needed} processors of their own, and '
-    assert found.remark.startswith(f'{said}this session has {there}: the tissue may run slower')
+    said = f'{2 * tools} force loops and the tissue need {needed} processors, and this session has '
+    assert found.remark.startswith(f'{said}{there}: on slow ones frames come late')
     if arms is not None:
         bridges = set(available) - arms
         assert found.processes['frames'] == arms and found.processes['bridge'] == bridges
@@ -98,6 +99,22 @@ def test_no_processor_has_too_many_loops_and_no_bridge_one_of_frames(
     assert arms <= 2 * len(of_arms)
 
 
+def test_a_session_says_at_its_start_that_processors_are_too_few(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert shared_out(['bridge', 'frames'], [0]).remark.startswith('1 force loop and the tissue ')
+    assert not shared_out(['bridge', 'arm'], [0]).remark, 'there is no tissue'
+    remark = shared_out(2 * SESSION, [0, 1]).remark
+    few = nullcontext(ANYWHERE._replace(remark=remark))
+    monkeypatch.setattr(supervisor, 'reserved_processors', lambda _: few)
+    events: list[Event] = []
+    nodes = [command('tissue_sim', Ledger(tmp_path / 'ledger'))]
+    with Supervisor(nodes, tmp_path / 'log', ENVIRONMENT, events.append) as running:
+        assert not events
+        assert running.start()
+    assert ('warning', 'session', remark) in [(e.kind, e.node, e.text) for e in events]
+
+
 def test_each_node_has_the_work_that_it_does() -> None:
     nodes = session_nodes(Path('scene'), Path('bag'), 0, 1.0, ['grasper'])
     work = {node.name: node.work for node in nodes}
@@ -111,7 +128,8 @@ def test_each_node_has_the_work_that_it_does() -> None:
 @pytest.mark.usefixtures('own_address')
 def test_a_second_session_of_the_machine_gets_none() -> None:
     with reserved_processors(SESSION) as first, reserved_processors(SESSION) as second:
-        assert second == ANYWHERE
+        assert not second.processes and not second.receivers
+        assert second.remark == first.remark
     with reserved_processors(SESSION) as again:
         assert again == first
 

@@ -113,23 +113,25 @@ def make_plan(
     task: Task,
     note: Callable[[str], None] = lambda text: None,
     say: Callable[[str], None] = lambda text: None,
+    *,
+    goes_on: bool = False,
 ) -> Plan:
-    """Return the plan for a scene: that of an earlier start, or a new one.
+    """Return the plan for a scene: that of an earlier start, or a new one, which is kept.
 
-    One by which something fits is kept. Where nothing does, the machine may have been busy.
+    One by which every method takes too long is made anew: the machine may have been busy.
 
     Args:
         task: the scene.
         note: gets one sentence if the plan is made anew.
         say: gets the name of the next measurement.
+        goes_on: whether a session goes on, by the method that it has.
     """
     known = recall(task, note)
-    if known is not None:
+    if known is not None and (goes_on or not known.late):
         return known
     warm_up()  # a kernel that is loaded meanwhile would count as cost
     found = plan(task, say)
-    if found.chosen is not None:
-        remember(task, found)
+    remember(task, found)
     return found
 
 
@@ -163,7 +165,8 @@ def make_simulation(
             'anew, or take them out of the scene'
         )
     task = make_task(settings, None if settings.method == 'auto' else mesh)
-    found = make_plan(task, note, note) if settings.method == 'auto' else None
+    known = mesh is not None
+    found = make_plan(task, note, note, goes_on=known) if settings.method == 'auto' else None
     taken = as_planned(settings, found)
     load_kernels(taken)
     simulation = TissueSimulation(

@@ -136,9 +136,7 @@ class TissueSimNode(ManagedNode):
     def _check_processors(self, threads: int) -> None:
         """Say whether the cores of the scene's budget are used, and are there."""
         processors, asked = len(os.sched_getaffinity(0)), f'tissue.budget.cores is {threads}'
-        shared = self._simulation.dynamics.parallel
-        self._threads = min(threads, processors) if shared else 1
-        if threads > 1 and not shared:
+        if threads > 1 and not self._simulation.dynamics.parallel:
             by = self._simulation.dynamics.stepping.integrator
             self.get_logger().warning(
                 f'{asked}, and one thread computes this tissue by {by}: several share only steps '
@@ -384,7 +382,7 @@ class TissueSimNode(ManagedNode):
             'omega_bound': simulation.dynamics.masses.omega,
             'step_bound': simulation.dynamics.time_steps.bound(),
             'active_nodes': simulation.dynamics.active_nodes,
-            'threads': self._threads,
+            'threads': simulation.dynamics.threads,
             'inverted': simulation.dynamics.inverted,
             'concession': self._governor.concession,
             'mesh_bytes': self._link.sent,

@@ -148,6 +148,12 @@ class Dynamics:
         )
 
     @property
+    def threads(self) -> int:
+        """Return how many threads compute a step of the nodes that move now."""
+        integrator, moving = self._integrator, self._active.count
+        return integrator.threads_for(moving) if isinstance(integrator, ParallelEuler) else 1
+
+    @property
     def active_nodes(self) -> int:
         """Number of moving nodes."""
         return self._active.count

@@ -309,9 +309,15 @@ class ParallelEuler(Integrator):
         moving = int(np.sum(spans[:, 1] - spans[:, 0]))
         if moving < self.min_nodes or len(operands.local.first):
             return super()._euler(operands, spans, *rest)
-        # On fewer processors so many threads are the fastest, with the same bits.
-        threads = min(self._threads, len(os.sched_getaffinity(0)))
-        return _team(threads).steps(operands, spans, *rest)
+        return _team(self.threads_for(moving)).steps(operands, spans, *rest)
+
+    def threads_for(self, moving: int) -> int:
+        """Return how many threads compute the steps of a number of moving nodes.
+
+        On fewer processors so many threads are the fastest, with the same bits.
+        """
+        processors = len(os.sched_getaffinity(0))
+        return min(self._threads, processors) if moving >= self.min_nodes else 1
 
 
 def make_integrator(

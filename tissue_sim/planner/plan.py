@@ -56,6 +56,7 @@ class Plan:
         worst: cost after cuts have shortened the step as far as the scene allows.
         caution: a sentence if the indentation is deeper than the checked range of the predictions.
         own: why the scene's own model fails the budget, if it does and is not among the rejected.
+        late: whether no method fits only because those that are accurate take too long.
     """
 
     chosen: Candidate | None
@@ -66,6 +67,7 @@ class Plan:
     worst: Cost | None = None
     caution: str = ''
     own: str = ''
+    late: bool = False
 
     def over(self, substeps: float, tetrahedra: int) -> str:
         """Return a sentence if the cut tissue exceeds the allowed cost, else ''.
@@ -133,7 +135,7 @@ def plan(task: Task, say: Callable[[str], None] = lambda text: None) -> Plan:
             caution, worst = _caution(probing), task.worst(best)
             return Plan(best, tuple(rejected), (), count, task.available, worst, caution, own)
     said = remedies(task, probing, tried)
-    return Plan(None, tuple(rejected), said, count, task.available)
+    return Plan(None, tuple(rejected), said, count, task.available, late=bool(tried))
 
 
 def _own(
